@@ -1,0 +1,31 @@
+"""Symbolic models of entry vehicles and their environment (CasADi)."""
+
+from models.atmosphere import Atmosphere, exponential, us76, us76_smooth
+from models.core import Model, ModelError, Status, Var, define
+from models.entry import EARTH, SPHERE, Planet, entry_3dof, entry_planar
+from models.vehicles import APOLLO, SHENZHOU, SOYUZ, Vehicle, from_ratios, vehicle
+from models.wind import Wind
+
+__all__ = [
+    "APOLLO",
+    "EARTH",
+    "SHENZHOU",
+    "SOYUZ",
+    "SPHERE",
+    "Atmosphere",
+    "Model",
+    "ModelError",
+    "Planet",
+    "Status",
+    "Var",
+    "Vehicle",
+    "Wind",
+    "define",
+    "entry_3dof",
+    "entry_planar",
+    "exponential",
+    "from_ratios",
+    "us76",
+    "us76_smooth",
+    "vehicle",
+]

@@ -1,0 +1,197 @@
+"""Flights of any model under any law: one CasADi function for the whole flight, exact stops, all cases at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from models.core import Array, Model, ModelError, Status, Var, as_batch, as_vector, evaluate, frozen
+from ocp import flight
+from ocp.laws import Law
+from ocp.methods import RK8, Method
+from ocp.stops import Stop
+from ocp.trajectory import SimulationError, Trajectory
+
+
+def simulate(
+    model: Model,
+    law: Law,
+    *,
+    x0: ArrayLike,
+    p: Mapping[str, float] | ArrayLike | None = None,
+    until: Stop | None = None,
+    t_max: float | None = None,
+    method: Method = RK8(step=0.5),  # noqa: B008 (a frozen value)
+    throw: bool = True,
+) -> Trajectory:
+    """Fly a model from x0 under a law to a stop condition or an end time.
+
+    Parameters
+    ----------
+    model : Model
+    law : Law
+        ``ocp.constant(...)``, ``ocp.profile(...)``, ``gains.law(...)`` or a user's own ``ocp.sampled(...)``.
+    x0 : array_like, shape (nx,)
+        Initial state, SI and radians, inside ``Var.valid``.
+    p : mapping or array_like, optional
+        Parameters by name (others keep their default) or all of them.
+    until : Stop, optional
+        ``ocp.falls_below("h", 10e3)`` and the like.  Crossings are looked for at the ends of groups of four steps
+        (at each sample of a sampled law) and located to 1e-12 of the group by re-integration.
+    t_max : float, optional
+        End time, s; 3600 when only `until` is given.
+    method : RK4, RK8 or Adaptive
+    throw : bool
+        Raise SimulationError when the flight does not end as asked; otherwise return it with its ``status``.
+
+    Returns
+    -------
+    Trajectory
+        Nodes at every step; a node stands twice where the integration restarted with another step or input.
+
+    Raises
+    ------
+    ModelError
+        Bad shapes, names, values outside ``Var.valid``, a start beyond the stop condition.
+    SimulationError
+        STOP_NOT_REACHED or NONFINITE, with the trajectory up to the last good state.
+    """
+    end = flight.require_until_or_end(until, t_max)
+    start = as_vector("x0", x0, model.states)[None]
+    params = as_vector("p", model.parameters(p), model.params)[None]
+    engine = flight.prepare(model, law.bind(model), method, end)
+    values = ", ".join(v.shown(value) for v, value in zip(model.states, start[0], strict=True))
+    if until is not None and engine.first_margins(start, params, until)[0] <= 0:
+        raise ModelError(f"simulate: x0 ({values}) is already past the stop condition ({until.text()}); start before it or change it")
+    outcome, chunks = flight.fly_to_stop(engine, start, params, until)
+    t, x, u = flight.nodes(engine, start, params, outcome, chunks)
+    status = outcome.status[0]
+    y = evaluate(model.out, x, u, params[0], finite=False)[0]
+    good = int(np.argmin(np.append(np.isfinite(y).all(axis=1), False)))  # nodes before the first output that is not finite
+    if good == 0:
+        raise ModelError(f"simulate: an output of {model.name} is not finite at x0 ({values}); start inside the domain of the model")
+    if good < len(t):
+        t, x, u, y, status = t[:good], x[:good], u[:good], y[:good], Status.NONFINITE
+    trajectory = Trajectory(t, x, u, y, params[0], model, status, engine.bound.sample is not None)
+    if throw and not status.ok:
+        last = ", ".join(v.shown(value) for v, value in zip(model.states, x[-1], strict=True))
+        wanted = f"; the stop condition was: {until.text()}" if until else ""
+        raise SimulationError(f"simulate: {status.name} at t = {t[-1]:.6g} s with {last}{wanted}. {status.value}", status, trajectory)
+    return trajectory
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Samples:
+    """What the law did in an ensemble: case (S,), t (S,) s, x (S, nx) and u (S, nu) at every call of the law."""
+
+    case: np.ndarray
+    t: Array
+    x: Array
+    u: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ensemble:
+    """End states of many flights.
+
+    Attributes
+    ----------
+    t : ndarray, shape (N,)
+        Stop times, s (of the last good state for a failed case).
+    x : ndarray, shape (N, nx)
+        States there.
+    status : tuple of Status, length N
+    model : Model
+    samples : Samples or None
+        Only on request.
+    """
+
+    t: Array
+    x: Array
+    status: tuple[Status, ...]
+    model: Model
+    samples: Samples | None = None
+
+    @property
+    def ok(self) -> np.ndarray:
+        """Mask of the cases that met their stop condition, shape (N,)."""
+        return np.array([s.ok for s in self.status], dtype=bool)
+
+    def __getitem__(self, name: str) -> Array:
+        """Column of a state at the stop, shape (N,)."""
+        if name not in {v.name for v in self.model.states}:
+            raise ModelError(f"ensemble: {name!r} is not a state; only end states are kept: {[v.name for v in self.model.states]}")
+        return self.x[:, self.model.index(name)]
+
+    def failures(self) -> list[tuple[int, str]]:
+        """(case number, reason) of the cases that failed."""
+        return [(i, f"{s.name}: {s.value}") for i, s in enumerate(self.status) if not s.ok]
+
+
+def simulate_ensemble(
+    model: Model,
+    law: Law,
+    *,
+    x0: ArrayLike,
+    p: ArrayLike | None = None,
+    until: Stop | None = None,
+    t_max: float | None = None,
+    method: Method = RK8(step=0.5),  # noqa: B008 (a frozen value)
+    progress: Callable[[float], None] | None = None,
+    samples: bool = False,
+) -> Ensemble:
+    """Fly N cases at once; a case that fails carries its reason and the others stand.
+
+    Arguments that are not listed are those of :func:`simulate`.
+
+    Parameters
+    ----------
+    x0 : array_like, shape (N, nx) or (nx,)
+        Initial states; a case outside ``Var.valid`` or past the stop condition gets OUT_OF_DOMAIN and is not flown.
+    p : array_like, shape (N, np) or (np,), optional
+    progress : callable, optional
+        Called with the finished fraction in [0, 1].
+    samples : bool
+        Keep time, state and input at every call of a sampled law (at every group of four steps of a continuous one).
+
+    Returns
+    -------
+    Ensemble
+    """
+    end = flight.require_until_or_end(until, t_max)
+    starts = np.atleast_2d(as_batch("x0", x0, model.states, domain=False))
+    params = np.atleast_2d(as_batch("p", model.p0 if p is None else p, model.params, domain=False))
+    if len(starts) == 0 or len(params) == 0:
+        raise ModelError("simulate_ensemble: no cases: x0 or p is empty; give at least one row")
+    cases = max(len(starts), len(params))
+    if len(starts) not in (1, cases) or len(params) not in (1, cases):
+        raise ModelError(f"simulate_ensemble: {len(starts)} rows of x0 beside {len(params)} of p; give equal numbers, or one row")
+    starts, params = (np.repeat(a, cases // len(a), axis=0) for a in (starts, params))
+    engine = flight.prepare(model, law.bind(model), method, end)
+    t, x, status = np.zeros(cases), starts.copy(), [Status.OUT_OF_DOMAIN] * cases
+    kept: list[flight.Record] = []
+    inside = np.flatnonzero(_inside(starts, model.states) & _inside(params, model.params))
+    for first in range(0, len(inside), flight.BLOCK):
+        rows = inside[first : first + flight.BLOCK]
+        report = None if progress is None else _scaled(progress, first / len(inside), len(rows) / len(inside))
+        chunks: list[flight.Record] | None = [] if samples else None
+        outcome, _ = flight.fly_to_stop(engine, starts[rows], params[rows], until, progress=report, record=chunks)
+        kept += [(rows[case], times, states, inputs) for case, times, states, inputs in chunks or ()]
+        t[rows], x[rows] = outcome.t, engine.split(outcome.c)[0]
+        for i, value in zip(rows, outcome.status, strict=True):
+            status[i] = value
+    taken = Samples(*(np.concatenate(parts) for parts in zip(*kept, strict=True))) if kept else None
+    return Ensemble(frozen(t), frozen(x), tuple(status), model, taken)
+
+
+def _inside(values: Array, variables: tuple[Var, ...]) -> np.ndarray:
+    low = np.array([v.valid[0] for v in variables])
+    high = np.array([v.valid[1] for v in variables])
+    return np.asarray(((values >= low) & (values <= high)).all(axis=1))
+
+
+def _scaled(progress: Callable[[float], None], offset: float, width: float) -> Callable[[float], None]:
+    return lambda fraction: progress(offset + width * fraction)

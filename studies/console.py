@@ -1,0 +1,209 @@
+"""What every command shares: exit codes, messages on stderr, one JSON object on stdout, tables, progress."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import json
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from enum import IntEnum
+from types import FrameType
+from typing import Any
+
+Progress = Callable[[str, float], None]
+
+
+class Code(IntEnum):
+    """Exit codes of the command line."""
+
+    DONE = 0
+    INPUT = 2
+    CASES_FAILED = 3
+    MACHINE = 4
+    INTERRUPTED = 130
+
+
+class InputError(ValueError):
+    """A command-line value that cannot be accepted; the text names the option, the value, what was expected and what to do."""
+
+
+def guard(call: Callable[[], None]) -> int:
+    """Run a command and turn every way in which it can end into an exit code and, where due, one message on stderr."""
+    try:
+        try:
+            call()
+        finally:
+            _flush()
+    except SystemExit as end:
+        return _code_of(end)
+    except KeyboardInterrupt:
+        return _interrupted()
+    except BrokenPipeError:
+        _drop_stdout()
+        return Code.DONE
+    except (OSError, MemoryError) as error:
+        _drop_stdout()
+        say(f"reentry: the machine refused: {_machine_text(error)}")
+        return Code.MACHINE
+    except ImportError as error:
+        say(f"reentry: a part of the installation is missing: {error}; run `reentry doctor`")
+        return Code.MACHINE
+    except Exception as error:
+        if isinstance(error, _input_errors()):
+            say(str(error))
+            return Code.INPUT
+        if os.environ.get("REENTRY_DEBUG") == "1":
+            raise
+        say(
+            f"reentry: internal error: {type(error).__name__}: {error}\n"
+            "This is a fault of the program, not of your input. Please report it with the command line and the scenario"
+            " (--print-scenario); REENTRY_DEBUG=1 shows where it happened."
+        )
+        return Code.MACHINE
+    return Code.DONE
+
+
+@contextlib.contextmanager
+def termination_as_interrupt() -> Iterator[None]:
+    """SIGTERM ends a command as Ctrl-C does, so that private files are removed on the way out."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread may set handlers
+        return
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def say(text: str) -> None:
+    """One message for people, on stderr; a closed stderr is no reason to fail."""
+    with contextlib.suppress(OSError, ValueError):
+        print(text, file=sys.stderr, flush=True)
+
+
+def print_text(text: str) -> None:
+    """Text on stdout, delivered at once so that a full disk shows here."""
+    print(text, flush=True)
+
+
+def to_json(data: Mapping[str, Any]) -> str:
+    """JSON text; NaN and infinity are refused."""
+    return json.dumps(data, indent=1, allow_nan=False)
+
+
+def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    """Table on stdout; cells are shown as they are, never read as markup."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=Text(title), title_justify="left")
+    for i, column in enumerate(columns):
+        numeric = bool(rows) and all(isinstance(row[i], (int, float)) for row in rows)
+        table.add_column(Text(column), justify="right" if numeric else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*(Text(_cell(value)) for value in row))
+    Console(highlight=False).print(table)
+    sys.stdout.flush()
+
+
+@contextlib.contextmanager
+def work() -> Iterator[Progress | None]:
+    """Long work: a progress bar on stderr if that is a terminal, and stdout kept free of what libraries print."""
+    with _libraries_to_stderr():
+        if not sys.stderr.isatty():
+            yield None
+            return
+        from rich.console import Console
+        from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+        from rich.progress import Progress as Bars
+
+        columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
+        with Bars(*columns, console=Console(stderr=True), transient=True, redirect_stdout=False) as bars:
+            tasks: dict[str, Any] = {}
+
+            def report(stage: str, fraction: float) -> None:
+                if stage not in tasks:
+                    tasks[stage] = bars.add_task(stage, total=1.0)
+                bars.update(tasks[stage], completed=min(max(fraction, 0.0), 1.0))
+
+            yield report
+
+
+@contextlib.contextmanager
+def _libraries_to_stderr() -> Iterator[None]:
+    """Solvers print from C to file descriptor 1; whoever reads our JSON must not see it."""
+    _flush()
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(contextlib.redirect_stdout(sys.stderr))
+        with contextlib.suppress(OSError):  # a closed stdout or stderr has nothing to protect
+            saved = os.dup(1)
+            stack.callback(os.close, saved)
+            os.dup2(2, 1)
+            stack.callback(os.dup2, saved, 1)
+            stack.callback(_flush_c)
+        yield
+
+
+def _flush_c() -> None:
+    with contextlib.suppress(OSError, AttributeError, TypeError):
+        ctypes.CDLL(None).fflush(None)
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _flush() -> None:
+    if sys.stdout is not None:
+        sys.stdout.flush()
+
+
+def _drop_stdout() -> None:
+    """Send what is still buffered nowhere, or the interpreter would fail once more on its way out."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        descriptor = sys.stdout.fileno()
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, descriptor)
+        os.close(nowhere)
+
+
+def _code_of(end: SystemExit) -> int:
+    code = end.code if isinstance(end.code, int) else Code.DONE
+    if code == Code.INTERRUPTED:
+        return _interrupted()
+    if code == 1:
+        # the reader of a pipe has gone, for instance `reentry gains --json | head -1`: it has all it wanted
+        _drop_stdout()
+        return Code.DONE
+    return code
+
+
+def _interrupted() -> int:
+    say("reentry: interrupted; no file was left half written")
+    return Code.INTERRUPTED
+
+
+def _machine_text(error: BaseException) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        place = error.filename2 or error.filename
+        return f"{place}: {error.strerror}" if place else error.strerror
+    return str(error) or ("not enough memory" if isinstance(error, MemoryError) else type(error).__name__)
+
+
+def _input_errors() -> tuple[type[Exception], ...]:
+    """Exceptions that mean a wrong input; classes of modules never imported cannot have been raised."""
+    places = {"models.checked": "ModelError", "studies.scenario_text": "ScenarioError", "studies.files": "OutputError"}
+    known = [getattr(sys.modules[module], name) for module, name in places.items() if module in sys.modules]
+    return (InputError, *known)
