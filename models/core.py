@@ -25,7 +25,7 @@ from models.checked import (
     frozen,
     unknown_name,
 )
-from models.drawing import new_figure
+from models.drawing import html_table, new_figure
 
 __all__ = [
     "Array",
@@ -150,16 +150,13 @@ class Model:
         return f"Model({self.name}: states [{names[0]}], inputs [{names[1]}], outputs [{names[2]}], parameters [{names[3]}])"
 
     def _repr_html_(self) -> str:
-        rows = []
+        rows: list[tuple[str | float, ...]] = []
         groups = (("state", self.states), ("input", self.inputs), ("parameter", self.params), ("output", self.outputs))
         for kind, variables in groups:
             for i, var in enumerate(variables):
-                default = f"{self.p0[i]:.8g}" if kind == "parameter" else ""
-                cells = (kind, var.name, var.text, var.unit, default)
-                rows.append("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in cells) + "</tr>")
-        head = "".join(f"<th>{c}</th>" for c in ("kind", "name", "meaning", "unit", "default"))
+                rows.append((kind, var.name, var.text, var.unit, float(self.p0[i]) if kind == "parameter" else ""))
         title = f"<b>{html.escape(self.name)}</b> <small>{html.escape(self.source)}</small>"
-        return f"<div>{title}<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
+        return f"<div>{title}{html_table(('kind', 'name', 'meaning', 'unit', 'default'), rows)}</div>"
 
     def plot(self) -> Any:
         """Structure of the model: which derivative depends on which state and input.  Returns a matplotlib Figure."""

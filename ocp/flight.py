@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 
 from models.core import Array, Model, ModelError, Status, as_finite, as_scalar, evaluate
+from models.native import Native
 from ocp.laws import BoundLaw
 from ocp.methods import Method, group_of_steps
 from ocp.stops import Stop, crossing_fraction
@@ -61,7 +62,10 @@ def _loop(group: ca.Function, count: int, store: bool) -> ca.Function:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Engine:
-    """A model under a law, ready to fly over given group edges (times, s, shape (M + 1,))."""
+    """A model under a law, ready to fly over given group edges (times, s, shape (M + 1,)).
+
+    `native` is the group's first output as compiled code, if ensembles are to use it.
+    """
 
     model: Model
     bound: BoundLaw
@@ -69,6 +73,7 @@ class Engine:
     prepare: ca.Function
     n: int
     edges: Array
+    native: Native | None = None
 
     def start(self, x0: Array) -> Array:
         """Carry c (N, nc) at the first edge; no input has been given yet, so it stands at zero."""
@@ -140,8 +145,16 @@ class Engine:
     def _carry(self, c: Array, p: Array, index: np.ndarray, fraction: Array) -> Array:
         """Carries (M, nc) after fractions (M,) of the groups `index` (M,)."""
         start, length = self.edges[index], self.edges[index + 1] - self.edges[index]
+        if self.bound.sample is None:
+            q = self.queue(start, start + fraction * length)
+        else:  # a sampled law reads its tables at the start of the group, whatever part of it is flown
+            groups, row = np.unique(index, return_inverse=True)
+            q = self.queue(self.edges[groups], self.edges[groups + 1])[row]
+            q[:, 1] = fraction * length
+        if self.native is not None:
+            return self.native.run(c, q, p)[0][0]
         try:
-            return evaluate(self.group, c, self.queue(start, start + fraction * length), p, finite=False)[0]
+            return evaluate(self.group, c, q, p, finite=False)[0]
         except RuntimeError:
             return np.full(c.shape, np.nan)
 
@@ -277,23 +290,33 @@ def _settle(
     where = np.argmax(event, axis=1)
     rows = np.arange(cases)
     before = np.where((where == 0)[:, None], c[active], flown[rows, np.maximum(where - 1, 0)])
-    reach = np.where(ended & crossed[rows, where], 1.0, 0.0)
-    for k in np.flatnonzero(ended & ~finite[rows, where]):
-        i = active[k]
-        result.t[i], result.c[i] = engine.edges[first + where[k]], before[k]
-        result.group[i], result.status[i] = first + where[k], Status.NONFINITE
-        if until is not None:
-            reach[k] = engine.reach(before[k], p[i], int(first + where[k]), until)
-    hit = np.flatnonzero(reach > 0)
-    if hit.size and until is not None:
-        index = first + where[hit]
-        fraction, carry = engine.to_stop(before[hit], p[active[hit]], index, reach[hit], until)
-        for k in np.flatnonzero(np.isfinite(carry).all(axis=1)):
-            i, edge = active[hit[k]], engine.edges[index[k]]
-            result.t[i] = edge + fraction[k] * (engine.edges[index[k] + 1] - edge)
-            result.c[i], result.group[i], result.fraction[i] = carry[k], index[k], fraction[k]
-            result.status[i] = Status.OK
+    conclude(engine, before[ended], p, active[ended], first + where[ended], crossed[rows, where][ended], until, result)
     return ~ended
+
+
+def conclude(
+    engine: Engine, before: Array, p: Array, cases: np.ndarray, index: np.ndarray, crossed: np.ndarray, until: Stop | None, result: Outcome
+) -> None:
+    """Record `cases` that ended in the groups `index`: at their stop where they crossed it, else as NONFINITE with the last good carry.
+
+    A case without a finite end of its group may still have met the stop before: it is looked for.
+    """
+    reach = crossed.astype(float)
+    for k in np.flatnonzero(~crossed):
+        i = cases[k]
+        result.t[i], result.c[i] = engine.edges[index[k]], before[k]
+        result.group[i], result.status[i] = index[k], Status.NONFINITE
+        if until is not None:
+            reach[k] = engine.reach(before[k], p[i], int(index[k]), until)
+    hit = np.flatnonzero(reach > 0)
+    if hit.size == 0 or until is None:
+        return
+    fraction, carry = engine.to_stop(before[hit], p[cases[hit]], index[hit], reach[hit], until)
+    for k in np.flatnonzero(np.isfinite(carry).all(axis=1)):
+        i, edge = cases[hit[k]], engine.edges[index[hit[k]]]
+        result.t[i] = edge + fraction[k] * (engine.edges[index[hit[k]] + 1] - edge)
+        result.c[i], result.group[i], result.fraction[i] = carry[k], index[hit[k]], fraction[k]
+        result.status[i] = Status.OK
 
 
 def nodes(engine: Engine, x0: Array, p: Array, outcome: Outcome, chunks: list[tuple[Array, ...]]) -> tuple[Array, Array, Array]:

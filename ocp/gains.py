@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -12,10 +11,11 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
 from models.checked import Array, ModelError, Var, as_finite, frozen
-from models.drawing import new_figure
+from models.drawing import html_table, new_figure
 
 if TYPE_CHECKING:
     from ocp.laws import Law
+    from ocp.sweep_flow import Dense
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,12 +35,19 @@ class Certificate:
         Time-invariant problems only: largest real part of the closed-loop eigenvalues, 1/s (for a sampled loop the
         logarithm of the largest magnitude, per step).  None for time-varying gains: a frozen loop may be unstable
         and the gain right.
+    local_residual : float or None
+        Differential equation: largest defect of an interval in the coordinates in which S at its begin has unit diagonal
+        (None elsewhere), so that it sees a small S after a heavy terminal weight too.  It bounds K: a change of S_ij by
+        e sqrt(S_ii S_jj) changes K_aj by at most e sum_i |R^-1 B^T|_ai sqrt(S_ii S_jj), and the Riccati equation never
+        enlarges a relative error of S on its way back, so that e at a node is at most the sum of these defects over the
+        later steps (times the condition number of S scaled to unit diagonal, in the worst direction).
     """
 
     riccati_residual: float
     min_eig_S: float
     cond_S: float
     spectral_abscissa: float | None = None
+    local_residual: float | None = None
 
 
 UNCERTIFIED = Certificate(np.inf, -np.inf, np.inf)  # nothing is proven
@@ -77,6 +84,9 @@ class Gains:
         ``UNCERTIFIED`` only where the caller asked for gains without proof.
     states, inputs : tuple of Var
         Names, units and scales; empty for plain matrices.
+    dense : Dense, optional
+        K and k between the nodes, from the sweep that made them.  Leave it out with gains of another origin; it is dropped
+        where t, K or k are not those of the sweep.
     """
 
     t: Array
@@ -88,6 +98,7 @@ class Gains:
     certificate: Certificate
     states: tuple[Var, ...] = ()
     inputs: tuple[Var, ...] = ()
+    dense: Dense | None = None
 
     def __post_init__(self) -> None:
         for name in ("t", "K", "k", "S", "x0", "u0"):
@@ -104,6 +115,8 @@ class Gains:
         for name, size in (("states", nx), ("inputs", nu)):
             if len(getattr(self, name)) not in (0, size):
                 raise ModelError(f"Gains: {name}: expected {size} variables or none, got {len(getattr(self, name))}")
+        if self.dense is not None and not self.dense.made(self.t, self.K, self.k):
+            object.__setattr__(self, "dense", None)
 
     def at(self, t: ArrayLike) -> GainSample:
         """Gains and reference at any times.
@@ -116,8 +129,9 @@ class Gains:
         Returns
         -------
         GainSample
-            Cubic spline over each smooth stretch; at a jump the value after it; before the first and after the last
-            node the first and last value.
+            K and k of :func:`ocp.tvlqr` from its sweep, as accurate between the nodes as on them; everything else by a cubic
+            spline over each smooth stretch.  At a jump the value after it; before the first and after the last node
+            the first and last value.
 
         Raises
         ------
@@ -128,10 +142,13 @@ class Gains:
         if times.ndim != 1:
             raise ModelError(f"t: expected shape (M,), got {times.shape}")
         n, (nu, nx) = len(self.t), self.K.shape[1:]
-        table = np.hstack([self.K.reshape(n, -1), self.k, self.x0, self.u0])
-        values = _interpolate(self.t, table, times)
-        parts = np.split(values, np.cumsum([nu * nx, nu, nx]), axis=1)
-        return GainSample(*(frozen(v) for v in (times, parts[0].reshape(-1, nu, nx), *parts[1:])))
+        if self.dense is not None:
+            x0, u0 = np.split(_interpolate(self.t, np.hstack([self.x0, self.u0]), times), [nx], axis=1)
+            K, k = self.dense.at(np.clip(times, self.t[0], self.t[-1]))
+        else:
+            table = np.hstack([self.K.reshape(n, -1), self.k, self.x0, self.u0])
+            K, k, x0, u0 = np.split(_interpolate(self.t, table, times), np.cumsum([nu * nx, nu, nx]), axis=1)
+        return GainSample(*(frozen(v) for v in (times, K.reshape(-1, nu, nx), k, x0, u0)))
 
     def law(self, *, sample: float | None = None, limits: tuple[ArrayLike, ArrayLike] | None = None) -> Law:
         """The sampled law u = u0(t) - k(t) - K(t) (x - x0(t)) for ``ocp.simulate``.
@@ -189,16 +206,14 @@ class Gains:
         facts = f"Riccati residual {c.riccati_residual:.2g}, smallest scaled eigenvalue of S {c.min_eig_S:.2g}, condition {c.cond_S:.2g}"
         if c.spectral_abscissa is not None:
             facts += f", spectral abscissa {c.spectral_abscissa:.4g}"
-        head = "<th>input</th><th>state</th>" + ("<th>K</th>" if len(self.t) == 1 else "<th>first</th><th>mean</th><th>last</th>")
-        body = []
+        head = ("input", "state", *(("K",) if len(self.t) == 1 else ("first", "mean", "last")))
+        body: list[tuple[str | float, ...]] = []
         for i, row in enumerate(rows):
             for j, column in enumerate(columns):
                 values = self.K[:, i, j]
                 shown = [values[0]] if len(self.t) == 1 else [values[0], self._mean(values), values[-1]]
-                cells = "".join(f"<td>{v:.6g}</td>" for v in shown)
-                body.append(f"<tr><td>{html.escape(row)}</td><td>{html.escape(column)}</td>{cells}</tr>")
-        table = f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>"
-        return f"<div><b>Gains</b> u = u0 - k - K (x - x0), {span}<br><small>{facts}</small>{table}</div>"
+                body.append((row, column, *shown))
+        return f"<div><b>Gains</b> u = u0 - k - K (x - x0), {span}<br><small>{facts}</small>{html_table(head, body)}</div>"
 
     def _mean(self, values: Array) -> float:
         duration = self.t[-1] - self.t[0]

@@ -134,6 +134,14 @@ def jacobi_scale(S: Array) -> Array:
     return np.asarray(1.0 / np.sqrt(np.where(diagonal > np.finfo(float).tiny, diagonal, 1.0)))
 
 
+def packed_places(n: int) -> np.ndarray:
+    """Place (n, n) of each element of a symmetric matrix in its upper triangle, packed row by row."""
+    place = np.zeros((n, n), dtype=int)
+    rows, columns = np.triu_indices(n)
+    place[rows, columns] = place[columns, rows] = np.arange(len(rows))
+    return place
+
+
 def riccati_problem(
     A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike, N: ArrayLike | None
 ) -> tuple[Array, Array, Array, Array, Array]:

@@ -24,7 +24,7 @@ class Schedule:
     K : ndarray, shape (m + 1, n)
         Gains before, between and after the breakpoints.
     residual : float
-        Root mean square of what is left: of K - K(t), each gain relative to its own rms, or of the command.
+        Root mean square of what is left: of K - K(t), each gain relative to its own rms, or of the command (unweighted).
     """
 
     names: tuple[str, ...]
@@ -35,6 +35,8 @@ class Schedule:
     def __post_init__(self) -> None:
         object.__setattr__(self, "breakpoints", frozen(as_finite("Schedule: breakpoints", self.breakpoints)))
         object.__setattr__(self, "K", frozen(as_finite("Schedule: K", self.K)))
+        if self.breakpoints.ndim != 1:
+            raise ModelError(f"Schedule: breakpoints: expected shape (m,), got {self.breakpoints.shape}; give a flat list")
         if self.K.shape != (len(self.breakpoints) + 1, len(self.names)):
             wanted = (len(self.breakpoints) + 1, len(self.names))
             raise ModelError(f"Schedule: K: expected shape {wanted}, one row for each piece, got {self.K.shape}")
@@ -43,7 +45,10 @@ class Schedule:
 
     def __call__(self, variable: ArrayLike) -> Array:
         """Gains (M, n) at values (M,) of the scheduling variable."""
-        return self.K[np.searchsorted(self.breakpoints, np.atleast_1d(as_finite("schedule", variable)), side="right")]
+        values = np.atleast_1d(as_finite("schedule", variable))
+        if values.ndim != 1:
+            raise ModelError(f"schedule: expected values of shape (M,), got {values.shape}; flatten them")
+        return self.K[np.searchsorted(self.breakpoints, values, side="right")]
 
 
 Breakpoints = Mapping[str, Sequence[float]]
@@ -78,7 +83,7 @@ def time_means(t: ArrayLike, K: ArrayLike, *, names: Sequence[str], breakpoints:
 
 
 def best_breakpoints(t: ArrayLike, K: ArrayLike, *, pieces: int) -> Array:
-    """Breakpoints (pieces - 1,) at nodes that leave the least integral of (K - piece mean)^2, by dynamic programming.
+    """Breakpoints (pieces - 1,) that leave the least integral of (K - piece mean)^2, by dynamic programming.
 
     Parameters
     ----------
@@ -86,13 +91,17 @@ def best_breakpoints(t: ArrayLike, K: ArrayLike, *, pieces: int) -> Array:
     K : array_like, shape (N,) or (N, n)
         Several gains share the breakpoints, each weighted by its own mean square.
     pieces : int
-        2 or more; the answer is the global optimum over the nodes (thinned to 400).
+        2 to 100; the answer is the global optimum over a uniform grid of as many points as nodes, at most 400.
     """
-    if pieces < 2:
-        raise ModelError(f"best_breakpoints: pieces must be at least 2, got {pieces}")
+    if isinstance(pieces, bool) or not isinstance(pieces, int) or not 2 <= pieces <= 100:
+        raise ModelError(f"best_breakpoints: pieces must be a whole number from 2 to 100, got {pieces!r}")
     nodes, values = as_finite("t", t), as_finite("K", K)
     values = values[:, None] if values.ndim == 1 else values
-    grid = np.linspace(nodes[0], nodes[-1], min(400, max(len(nodes), pieces + 1)))
+    if nodes.ndim != 1 or len(nodes) < 2 or values.shape[:1] != nodes.shape or values.ndim != 2:
+        raise ModelError(f"best_breakpoints: expected t (N,) with N >= 2 and K (N,) or (N, n), got {nodes.shape} and {values.shape}")
+    if (np.diff(nodes) < 0).any() or nodes[-1] == nodes[0]:
+        raise ModelError("best_breakpoints: t must not decrease and must span an interval; sort the nodes")
+    grid = np.linspace(nodes[0], nodes[-1], min(400, max(len(nodes), 2 * pieces + 1)))
     sampled = np.column_stack([np.interp(grid, nodes, column) for column in values.T])
     sampled = sampled / np.sqrt(np.maximum((sampled**2).mean(axis=0), np.finfo(float).tiny))
     middle = 0.5 * (sampled[1:] + sampled[:-1])  # one value for each cell of equal width
@@ -144,7 +153,10 @@ def fit_commands(
     commands = as_finite("u", u)
     if commands.shape != moments.shape:
         raise ModelError(f"fit_commands: u: expected shape {moments.shape}, got {commands.shape}")
-    root = np.ones(len(moments)) if weight is None else np.sqrt(as_finite("weight", weight))
+    weights = np.ones(len(moments)) if weight is None else as_finite("weight", weight)
+    if weights.shape != moments.shape or (weights < 0).any():
+        raise ModelError(f"fit_commands: weight: expected shape {moments.shape} and no negative value, got {weights.shape}")
+    root = np.sqrt(weights)
     blocks, owner = [], []
     for column, own in enumerate(cuts.own):
         piece = np.searchsorted(own, moments, side="right")
@@ -164,7 +176,7 @@ def fit_commands(
     K = np.empty((len(edges), len(names)))
     for value, (column, k) in zip(constants, owner, strict=True):
         K[np.searchsorted(cuts.own[column], edges, side="right") == k, column] = value
-    left = (design / scale) @ solution - commands * root
+    left = (K[np.searchsorted(cuts.union, moments, side="right")] * deviations).sum(axis=1) - commands
     return Schedule(tuple(names), cuts.union, K, float(np.sqrt(np.mean(left**2))))
 
 

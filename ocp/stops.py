@@ -22,11 +22,14 @@ class Stop:
         return " or ".join(f"{n} {'rises above' if s > 0 else 'falls below'} {v:.9g}" for n, v, s in self.conditions)
 
     def expression(self, model: Model, x: ca.SX, u: ca.SX, p: ca.SX) -> ca.SX:
-        """The margin of a single condition as a symbolic expression, in units of the condition's scale."""
-        name, value, sign = self.conditions[0]
-        group, index = _place(model, name)
-        column = x[index] if group == "state" else model.out(x, u, p)[index]
-        return sign * (value - column) / max(abs(value), _scale(model, name))
+        """The least margin of the conditions as a symbolic expression, in units of each condition's scale."""
+        least = ca.SX(ca.inf)
+        for name, value, sign in self.conditions:
+            group, index = _place(model, name)
+            column = x[index] if group == "state" else model.out(x, u, p)[index]
+            margin = sign * (value - column) / max(abs(value), _scale(model, name))
+            least = margin if len(self.conditions) == 1 else ca.fmin(least, margin)
+        return least
 
     def margins(self, model: Model, x: Array, u: Array, p: Array) -> Array:
         """(M, number of conditions): positive before a crossing, <= 0 after it, in units of the condition's scale.

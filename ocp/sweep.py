@@ -1,206 +1,242 @@
 """Differential Riccati equation swept backward over nodes, with the defect of every interval and exact tangents.
 
-S' = -S A - A^T S + S W S - Q,  W = B R^-1 B^T.  A step spans four equal node intervals, whose five nodes are the
-abscissae of Butcher's fifth-order Runge-Kutta method: nothing is interpolated unless a step must be halved.  The steps
-run as one CasADi function.
-The proof is a second program, in NumPy with full matrices, that restarts from every swept S at half the step.
+S' = -S A - A^T S + S W S - Q,  W = L L^T = B R^-1 B^T.  A step spans four equal node intervals, whose five nodes are the abscissae
+of Butcher's fifth-order Runge-Kutta method: nothing is interpolated unless a step must be halved.
+
+Over a step the equation has the exact discrete form S <- Q_h + A_h^T S (I + G_h S)^-1 A_h, whose parts do not depend on S: they are
+integrated for all steps at once, and are smooth where S is not (a heavy terminal weight falls by orders of magnitude within the
+last step).  What remains to be done one step after another is a discrete Riccati recursion, one CasADi function.
+The proof is a second program (:mod:`ocp.sweep_flow`), another form of the equation, restarted from every swept S at half the step.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
-from scipy.sparse import csr_array
 
 from models.checked import Array, ModelError
+from ocp.riccati import packed_places
+from ocp.sweep_flow import ROWS, STAGE, WEIGHTS, Check, Flow, check, flow, interpolation_change, tangent_drive, unit_scale
+from ocp.sweep_grid import NodeData, Steps, blocks, cut, placed, positions
 
 TARGET = 1e-9  # a step whose defect is larger is halved
+LOCAL = 1e-8  # the same for the defect relative to the step's own S
+SLACK = 2.0  # no further pass while every defect is within this factor of its target
 LEVELS = 24  # passes of halving; each costs one sweep
 FINEST = 2.0**-20  # smallest step, as a part of the given one
-
-# Butcher 1964 (J. Austral. Math. Soc. 4, 179): six stages, order five, abscissae 0 1/4 1/4 1/2 3/4 1.
-STAGE = (0, 1, 1, 2, 3, 4)
-ROWS = ((), (1 / 4,), (1 / 8, 1 / 8), (0, -1 / 2, 1), (3 / 16, 0, 0, 9 / 16), (-3 / 7, 2 / 7, 12 / 7, -12 / 7, 8 / 7))
-WEIGHTS = (7 / 90, 0, 32 / 90, 12 / 90, 32 / 90, 7 / 90)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class NodeData:
-    """Coefficients on nodes: t (N,), A, W, Q (N, n, n), L (N, n, m) with L L^T = W; tangents dL, dW, dQ (nw, N, ...) or empty."""
-
-    t: Array
-    A: Array
-    L: Array
-    W: Array
-    Q: Array
-    dL: Array
-    dW: Array
-    dQ: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sweep:
-    """S (N, n, n), its tangents dS (nw, N, n, n), the largest scaled defect, and the scale d (n,): max over time of (d S d)_ii = 1."""
+    """The answer of a sweep.
+
+    Attributes
+    ----------
+    S, dS : ndarray, shapes (N, n, n), (nw, N, n, n)
+        On the nodes; tangents.
+    defect, local : float
+        Largest defect of a step, relative to S over all time and to S of that step; see :func:`riccati_sweep`.
+    scale : ndarray, shape (n,)
+        d: the maximum over time of (diag(d) S diag(d))_ii is one.
+    steps : Steps
+        Those that were taken, latest first.
+    flow : Flow
+        Of the check; gives S between the nodes.
+    gap : ndarray, shape (nb, n, n)
+        S of the sweep less S of the flow at the begin of each step.
+    """
 
     S: Array
     dS: Array
     defect: float
+    local: float
     scale: Array
+    steps: Steps
+    flow: Flow
+    gap: Array
 
 
-def blocks(t: Array) -> np.ndarray:
-    """Node indices (nb, 5) of the steps in rising time; refuses a grid that is not made of 4 k equal intervals a segment."""
-    if len(t) < 5:
-        raise ModelError(f"t: a sweep needs at least 5 nodes (4 equal intervals), got {len(t)}; sample the reference more finely")
-    jump = np.flatnonzero(np.diff(t) == 0)
-    first, last = np.concatenate([[0], jump + 1]), np.concatenate([jump, [len(t) - 1]])
-    count = last - first
-    wrong = np.flatnonzero((count % 4 != 0) | (count == 0))
-    if wrong.size:
-        i = wrong[0]
-        raise ModelError(
-            f"t: the segment from {t[first[i]]:.6g} s to {t[last[i]]:.6g} s has {count[i]} intervals, expected a multiple of 4;"
-            " choose 4 k equal intervals between jumps, and store the node of a jump twice"
-        )
-    steps = np.diff(t)
-    mean = np.zeros(len(steps))
-    smooth = steps > 0
-    mean[smooth] = np.repeat((t[last] - t[first]) / count, count)
-    uneven = np.flatnonzero(np.abs(steps - mean) > 1e-6 * np.maximum(mean, 0.0))
-    if uneven.size:
-        i = uneven[0]
-        raise ModelError(
-            f"t: the interval after {t[i]:.9g} s is {steps[i]:.6g} s long, its segment's mean is {mean[i]:.6g} s; use equal intervals"
-            " between jumps, and store the node at which the spacing changes twice"
-        )
-    starts = np.concatenate([np.arange(a, b, 4) for a, b in zip(first, last, strict=True)])
-    return np.asarray(starts[:, None] + np.arange(5))
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # judged by what comes out
+def riccati_sweep(data: NodeData, final: Array) -> Sweep:
+    """Backward solution of the differential Riccati equation on the nodes of `data`, and of its tangents.
 
+    Parameters
+    ----------
+    data : NodeData
+        Coefficients; every segment has 4 k equal intervals, a node at a jump is stored twice.
+    final : ndarray, shape (1 + nw, n, n)
+        S at the last node, then its tangents.
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Steps:
-    """Steps, latest first: node index at which each begins (nb,), its length in intervals (nb,), its duration (nb,) in s.
+    Returns
+    -------
+    Sweep
+        ``defect`` is the largest difference, over all steps and elements, between the swept S and two half steps of
+        the check program restarted from the sweep at the later end of that step; in the coordinates in which every
+        S_ii has the maximum 1 over time, so that it is relative and free of units.  ``local`` is the same in the
+        coordinates in which S at the begin of that step has unit diagonal.
 
-    Coefficients at the nine points 0, 1/8, ..., 1 of each step, latest point first: A, L, W, Q (nb, 9, ...) and
-    tangents dL, dW, dQ (nw, nb, 9, ...).
+    Raises
+    ------
+    ModelError
+        A grid of another kind; S beyond the floating-point range.
+
+    Notes
+    -----
+    Steps are halved until their defects are about 1e-9 and their local defects about 1e-8 (where rounding alone is larger, it
+    takes the place of S in the scale), on coefficients interpolated within its segment by polynomials of degree five.  The
+    difference to interpolation of degree three then counts as defect too.
     """
+    start = blocks(data.t)[::-1, 0].astype(float)
+    steps = placed(data, start, np.full(len(start), 4.0))
+    most = 16 * len(start) + 4096  # more halving than that is no stretch of fast motion but a problem without an answer
+    for attempt in range(LEVELS + 1):
+        ends = _sweep(steps, final[0])
+        sound = _sound(ends)
+        scale = unit_scale(np.abs(np.diagonal(ends[: sound + 1], axis1=1, axis2=2)).max(axis=0))
+        proof = check(steps, ends[:-1], np.finfo(float).eps / scale**2)
+        scales = (scale, _own_scale(ends, proof, scale)[:sound])
+        defects = [_largest((proof.S - ends[1:])[:sound], d) for d in scales]
+        halvings = _halvings(steps, *defects)
+        if not halvings.any() or len(steps.h) > most or attempt == LEVELS:
+            break
+        steps = placed(data, *cut(steps, halvings))
+    if sound < len(steps.h):
+        raise ModelError(_overflow(data.t, steps, sound))
+    at = flow(proof)
+    S, dS = _at_points(steps, at, ends, final[1:])
+    where = positions(steps.begin, steps.length, 5).T
+    hit = where == np.round(where)
+    filled = np.empty((len(final), *data.values.A.shape))
+    for out, values in zip(filled, (S, *dS), strict=True):
+        out[where[hit].astype(int)] = values[hit]
+    change = interpolation_change(data, steps, at)
+    defect, local = (
+        float(np.nan_to_num(np.maximum(v, _largest(change, d)), nan=np.inf).max()) for v, d in zip(defects, scales, strict=True)
+    )
+    return Sweep(filled[0], filled[1:], defect, local, scale, steps, at, ends[1:] - at.S[-1])
 
-    begin: Array
-    length: Array
-    h: Array
-    A: Array
-    L: Array
-    W: Array
-    Q: Array
-    dL: Array
-    dW: Array
-    dQ: Array
+
+def _halvings(steps: Steps, defects: Array, local: Array) -> np.ndarray:
+    """How often to halve each step; nothing where all are within SLACK of the targets."""
+    count, sound = np.zeros(len(steps.h), dtype=int), len(defects)
+    excess = np.nan_to_num(np.maximum(defects / TARGET, local / LOCAL), nan=np.inf)
+    if sound == len(count) and excess.max() <= SLACK:
+        return count
+    # A defect falls with the sixth power of the length; aim below the target, since another pass costs more than a few short steps.
+    wanted = np.log2(np.clip(4.0 * np.minimum(excess, 2.0**16), 1.0, None)) / 6
+    count[:sound] = np.where(excess > 1.0, np.ceil(wanted), 0)
+    count[sound : sound + 1] = 3
+    return np.minimum(count, np.maximum(np.log2(steps.length / (4 * FINEST)), 0).astype(int))
 
 
-def _lagrange(t: Array, position: Array, width: int) -> csr_array:
-    """Matrix (M, N) of Lagrange interpolation, inside its segment, to `position` (M,) counted in node indices.
+def _largest(change: Array, d: Array) -> Array:
+    """Largest element of each change (nb, n, n) in coordinates scaled by d (n,) or (nb, n)."""
+    return np.asarray(np.abs(change * d[..., :, None] * d[..., None, :]).max(axis=(1, 2), initial=0.0))
 
-    On `width` nodes, or as many as the segment has; a position on a node takes its value to the last bit.
+
+def _sound(ends: Array) -> int:
+    """Number of steps before the first that leaves the numbers; those after it say nothing."""
+    wrong = np.flatnonzero(~np.isfinite(ends[1:]).all(axis=(1, 2)))
+    return int(wrong[0]) if wrong.size else len(ends) - 1
+
+
+def _own_scale(ends: Array, proof: Check, scale: Array) -> Array:
+    """Scales (nb, n) that give S at the begin of each step unit diagonal, where its rounding is below LOCAL of it."""
+    n, S = len(scale), np.abs(ends[1:])
+    rounding = np.finfo(float).eps * S @ np.abs(proof.known[2, :, :n]) @ np.abs(proof.inverse)
+    floor = np.maximum(np.diagonal(rounding, axis1=1, axis2=2), np.finfo(float).eps ** 2 / scale**2)
+    return unit_scale(np.diagonal(S, axis1=1, axis2=2), floor / LOCAL)
+
+
+def _overflow(t: Array, steps: Steps, sound: int) -> str:
+    c, h = steps.values, float(steps.h[sound])
+    A, W, Q = (v[sound, -1] for v in (c.A, c.W, c.Q))
+    rate = float(np.abs(np.linalg.eigvals(np.block([[A, -W], [-Q, -A.T]]))).max())
+    where = f"near t = {np.interp(steps.begin[sound], np.arange(len(t)), t):.6g} s"
+    if h * rate > 1.0:
+        return (
+            f"riccati_sweep: the rates of the problem {where} reach {rate:.3g} 1/s, too fast for these nodes (the smallest step tried is"
+            f" {h:.3g} s): use finer nodes, or lower Q, or raise R"
+        )
+    return (
+        f"riccati_sweep: S exceeds the largest number {where}: over this horizon a mode grows beyond it that the input cannot reach,"
+        " or the weights do: shorten the horizon, give the mode an input, or lower Qf and Q"
+    )
+
+
+def _elements(steps: Steps) -> tuple[Array, Array, Array]:
+    """A_h, L_h and Q_h (nb, n, ...) with G_h = L_h L_h^T, by one Runge-Kutta step each from I, 0, 0.
+
+    Q_h solves the Riccati equation from zero, A_h is its closed loop, G_h the integral of A_h W A_h^T: all weights of the method
+    are positive, so that G_h is a sum of squares and L_h needs no square root.
     """
-    jump = np.flatnonzero(np.diff(t) == 0)
-    first, last = np.concatenate([[0], jump + 1]), np.concatenate([jump, [len(t) - 1]])
-    segment = np.searchsorted(last, position)
-    begin, count = first[segment], (last - first)[segment]
-    local = position - begin
-    size = np.minimum(width, count + 1)
-    start = np.clip(np.floor(local).astype(int) - (size // 2 - 1), 0, count + 1 - size)
-    x = local - start
-    weights = np.zeros((len(position), width))
-    for w in np.unique(size):
-        rows = size == w
-        for i in range(w):
-            others = [k for k in range(w) if k != i]
-            weights[rows, i] = np.prod([(x[rows] - k) / (i - k) for k in others], axis=0)
-    columns = (begin + start)[:, None] + np.arange(width)
-    used = weights != 0.0
-    pointer = np.concatenate([[0], np.cumsum(used.sum(axis=1))])
-    return csr_array((weights[used], columns[used], pointer), shape=(len(position), len(t)))
+    c, h = steps.values, steps.h[:, None, None]
+    n = c.A.shape[-1]
+    rates: list[tuple[Array, Array]] = []
+    columns = []
+    for row, weight, j in zip(ROWS, WEIGHTS, STAGE, strict=True):
+        A, L, Q = c.A[:, 2 * j], c.L[:, 2 * j], c.Q[:, 2 * j]
+        Qh, Ah = _combined(np.zeros_like(A), np.broadcast_to(np.eye(n), A.shape), row, rates, h)
+        V = np.swapaxes(L, 1, 2) @ Qh
+        product = Qh @ A
+        rates.append((product + np.swapaxes(product, 1, 2) - np.swapaxes(V, 1, 2) @ V + Q, Ah @ (A - L @ V)))
+        if weight:
+            columns.append(np.sqrt(h * weight) * (Ah @ L))
+    Qh, Ah = _combined(np.zeros_like(c.A[:, 0]), np.broadcast_to(np.eye(n), c.A[:, 0].shape), WEIGHTS, rates, h)
+    Lh = np.concatenate(columns, axis=-1)
+    if Lh.shape[-1] > n:
+        Lh = np.swapaxes(np.linalg.qr(np.swapaxes(Lh, 1, 2), mode="r"), 1, 2)
+    return Ah, Lh, Qh
 
 
-def _apply(matrix: csr_array, values: Array, steps: int, axis: int = 0) -> Array:
-    """Values (N, ...) at the points of all steps, (nb, points, ...)."""
-    moved = np.moveaxis(values, axis, 0)
-    flat = moved.reshape(len(moved), -1)
-    # A coefficient that does not vary is kept to the last bit.
-    out = np.repeat(flat[:1], matrix.shape[0], axis=0) if (flat == flat[:1]).all() else np.asarray(matrix @ flat)
-    out = out.reshape(steps, matrix.shape[0] // steps, *moved.shape[1:])
-    return np.moveaxis(out, (0, 1), (axis, axis + 1))
+def _combined(Qh: Array, Ah: Array, row: tuple[float, ...], rates: list[tuple[Array, Array]], h: Array) -> tuple[Array, Array]:
+    for a, (dQ, dA) in zip(row, rates, strict=True):
+        if a:
+            Qh, Ah = Qh + (h * a) * dQ, Ah + (h * a) * dA
+    return Qh, Ah
 
 
-def _positions(begin: Array, length: Array, points: int) -> Array:
-    return np.asarray(begin[:, None] + length[:, None] * np.linspace(1.0, 0.0, points))
+@lru_cache(maxsize=32)
+def _step(n: int, m: int) -> ca.Function:
+    """(z, data, h) -> z; z = upper triangle of S, data = A_h, L_h (column by column) and upper triangle of Q_h."""
+    size = n * (n + 1) // 2
+    z, d, h = ca.SX.sym("z", size), ca.SX.sym("d", n * n + n * m + size), ca.SX.sym("h")
+    place, upper = _indices(n)
+    S, Q = (ca.reshape(v[place], n, n) for v in (z, d[n * n + n * m :]))
+    A, L = ca.reshape(d[: n * n], n, n), ca.reshape(d[n * n : n * n + n * m], n, m)
+    SL = ca.mtimes(S, L)
+    # A sum of squares (Joseph's form): no difference of large numbers, whatever the size of S.
+    lower = ca.chol(ca.SX.eye(m) + ca.mtimes(L.T, SL)).T
+    gain = ca.solve(lower.T, ca.solve(lower, ca.mtimes(SL.T, A)))
+    loop = A - ca.mtimes(L, gain)
+    before = Q + ca.mtimes([loop.T, S, loop]) + ca.mtimes(gain.T, gain)
+    return ca.Function("riccati_step", [z, d, h], [ca.densify(before)[upper]], ["z", "data", "h"], ["before"])
 
 
-def _placed(data: NodeData, begin: Array, length: Array) -> _Steps:
-    matrix = _lagrange(data.t, _positions(begin, length, 9).ravel(), 6)
-    node = begin.astype(int)
-    interval = data.t[node + 1] - data.t[node]
-    parts = [_apply(matrix, v, len(begin)) for v in (data.A, data.L, data.W, data.Q)]
-    tangents = [_apply(matrix, v, len(begin), 1) for v in (data.dL, data.dW, data.dQ)]
-    return _Steps(begin, length, length * interval, *parts, *tangents)
+@lru_cache(maxsize=32)
+def _tangent_step(n: int) -> ca.Function:
+    """(z, data, h) -> z; z = upper triangle of a tangent, data = closed loop (column by column) and upper triangle of its drive."""
+    size = n * (n + 1) // 2
+    z, d, h = ca.SX.sym("z", size), ca.SX.sym("d", n * n + size), ca.SX.sym("h")
+    place, upper = _indices(n)
+    loop = ca.reshape(d[: n * n], n, n)
+    before = ca.mtimes([loop.T, ca.reshape(z[place], n, n), loop]) + ca.reshape(d[n * n :][place], n, n)
+    return ca.Function("tangent_step", [z, d, h], [ca.densify(before)[upper]], ["z", "data", "h"], ["before"])
 
 
-def _expressions(z: ca.SX, nodes: list[tuple[ca.SX, ca.SX, ca.SX]], h: ca.SX, n: int) -> ca.SX:
-    """One backward step of S, stored as its upper triangle."""
+def _indices(n: int) -> tuple[list[int], list[int]]:
+    """Place of every element of a square matrix in its packed triangle, and of every packed element in the matrix by columns."""
     rows, columns = np.triu_indices(n)
-    place = np.zeros((n, n), dtype=int)
-    place[rows, columns] = place[columns, rows] = np.arange(len(rows))
-    upper = [int(i) for i in rows + n * columns]
-
-    def rate(values: ca.SX, node: tuple[ca.SX, ca.SX, ca.SX]) -> ca.SX:
-        A, L, Q = node
-        S = ca.reshape(values[[int(i) for i in place.ravel()]], n, n)
-        product, factor = ca.mtimes(S, A), ca.mtimes(S, L)
-        full = product + product.T - ca.mtimes(factor, factor.T) + Q
-        return ca.densify(full)[upper]
-
-    stages: list[ca.SX] = []
-    for row, j in zip(ROWS, STAGE, strict=True):
-        value = z
-        for a, k in zip(row, stages, strict=True):
-            value = value + (h * a) * k if a else value
-        stages.append(rate(value, nodes[j]))
-    return z + h * sum((w * k for w, k in zip(WEIGHTS, stages, strict=True) if w), ca.SX.zeros(z.shape[0]))
+    return [int(i) for i in packed_places(n).ravel()], [int(i) for i in rows + n * columns]
 
 
-@lru_cache(maxsize=64)
-def _steps(n: int, m: int, pattern: tuple[tuple[int, ...], ...], seeds: int, count: int) -> ca.Function:
-    """(z, data, h) -> z over `count` steps; z = upper triangle of S, then of each tangent; data = 5 nodes of nonzeros."""
-    size, per_node = n * (n + 1) // 2, sum(len(p) for p in pattern)
-    z, d, h = ca.SX.sym("z", size), ca.SX.sym("d", 5 * per_node), ca.SX.sym("h")
-    nodes = []
-    for j in range(5):
-        position, matrices = j * per_node, []
-        for entries, columns in zip(pattern, (n, m, n), strict=True):
-            matrix = ca.SX(n, columns)
-            for entry in entries:
-                matrix[entry // columns, entry % columns] = d[position]
-                position += 1
-            matrices.append(matrix)
-        nodes.append((matrices[0], matrices[1], matrices[2]))
-    after = _expressions(z, nodes, h, n)
-    dz, dd = ca.SX.sym("dz", size, seeds), ca.SX.sym("dd", 5 * per_node, seeds)
-    if seeds:
-        after = ca.vertcat(after, ca.vec(ca.jtimes(after, ca.vertcat(z, d), ca.vertcat(dz, dd))))
-    step = ca.Function("riccati_step", [ca.vertcat(z, ca.vec(dz)), ca.vertcat(d, ca.vec(dd)), h], [after], ["z", "data", "h"], ["after"])
-    return step.mapaccum("riccati_sweep", count, {"base": -1})
-
-
-def _pattern(*values: Array) -> np.ndarray:
-    used = np.zeros(values[0].shape[-2:], dtype=bool)
-    for value in values:
-        used |= (value != 0).reshape(-1, *used.shape).any(axis=0)
-    return used
+@lru_cache(maxsize=128)
+def _repeated(step: ca.Function, count: int) -> ca.Function:
+    return step.mapaccum(f"{step.name()}s", count, {"base": -1})
 
 
 def run(function: ca.Function, z0: Array, data: Array, h: Array) -> Array:
@@ -219,180 +255,30 @@ def run(function: ca.Function, z0: Array, data: Array, h: Array) -> Array:
     return out
 
 
-def _sweep(steps: _Steps, final: Array) -> Array:
-    """S and tangents at the ends of the steps, (1 + nw, nb + 1, n, n), latest first; `final` is (1 + nw, n, n)."""
-    n, m, nw, count = steps.A.shape[-1], steps.L.shape[-1], len(steps.dQ), len(steps.h)
-    used = (_pattern(steps.A), _pattern(steps.L, steps.dL), np.triu(_pattern(steps.Q, steps.dQ)))
-    pattern = tuple(tuple(int(i) for i in np.flatnonzero(u)) for u in used)
+def _recursion(step: ca.Function, final: Array, matrices: tuple[Array, ...], symmetric: Array, h: Array) -> Array:
+    """Values (nb + 1, n, n) at the ends of the steps, latest first."""
+    count, n = len(h), final.shape[-1]
     rows, columns = np.triu_indices(n)
-    function = _steps(n, m, pattern, nw, count)
-    table = [np.concatenate([v[:, ::2, u] for v, u in zip((steps.A, steps.L, steps.Q), used, strict=True)], axis=-1)]
-    for dL, dQ in zip(steps.dL, steps.dQ, strict=True):
-        still = np.zeros((count, 5, int(used[0].sum())))
-        table.append(np.concatenate([still, dL[:, ::2, used[1]], dQ[:, ::2, used[2]]], axis=-1))
-    data = np.concatenate([v.reshape(count, -1) for v in table], axis=1)
-    out = run(function, final[:, rows, columns].ravel(), data, steps.h)
-    ends = np.empty((1 + nw, count + 1, n, n))
-    ends[:, 0] = final
-    upper = np.moveaxis(out.reshape(count, 1 + nw, len(rows)), 1, 0)
-    ends[:, 1:, rows, columns] = upper
-    ends[:, 1:, columns, rows] = upper
-    return ends
+    data = [np.swapaxes(v, 1, 2).reshape(count, -1) for v in matrices]
+    out = run(_repeated(step, count), final[rows, columns], np.hstack([*data, symmetric[:, rows, columns]]), h)
+    return np.concatenate([final[None], out[:, packed_places(n)]])
 
 
-def _rate(y: Array, A: Array, W: Array, Q: Array, dW: Array, dQ: Array) -> Array:
-    """-d/dt of S and of its tangents, stacked (1 + nw, M, n, n), in full matrices."""
-    S = y[0]
-    closed = A - W @ S
-    SA = S @ closed
-    base = SA + np.swapaxes(SA, -1, -2) + S @ W @ S + Q
-    if len(y) == 1:
-        return base[None]
-    product = y[1:] @ closed
-    return np.concatenate([base[None], product + np.swapaxes(product, -1, -2) - S @ dW @ S + dQ])
+def _sweep(steps: Steps, final: Array) -> Array:
+    """S at the ends of the steps, (nb + 1, n, n), latest first."""
+    Ah, Lh, Qh = _elements(steps)
+    return _recursion(_step(*Lh.shape[1:]), final, (Ah, Lh), Qh, steps.h)
 
 
-def _runge_kutta(rate: Callable[[int, Array], Array], y: Array, h: Array) -> Array:
-    stages: list[Array] = []
-    width = h[:, None, None]
-    for row, j in zip(ROWS, STAGE, strict=True):
-        value = y
-        if row:
-            value = y + width * sum((a * k for a, k in zip(row, stages, strict=True) if a), np.zeros(1))
-        stages.append(rate(j, value))
-    return np.asarray(y + width * sum((w * k for w, k in zip(WEIGHTS, stages, strict=True) if w), np.zeros(1)))
-
-
-@lru_cache(maxsize=1)
-def _quintic() -> tuple[Array, Array]:
-    """Weights (2, 3) of values and of slopes at 0, 1/2, 1 for the quintic Hermite interpolant at 1/4 and 3/4."""
-    powers = np.arange(6)
-    value = np.array([0.0, 0.5, 1.0])[:, None] ** powers
-    slope = np.zeros((3, 6))
-    slope[:, 1:] = powers[1:] * value[:, :-1]
-    at = np.array([0.25, 0.75])[:, None] ** powers
-    weights = np.linalg.solve(np.vstack([value, slope]).T, at.T).T
-    return weights[:, :3], weights[:, 3:]
-
-
-def _check(steps: _Steps, ends: Array) -> tuple[Array, Array]:
-    """Values at the five points of each step (1 + nw, nb, 5, n, n), and the difference (nb, n, n) of two half steps from the sweep."""
-
-    def rate_from(point: int) -> Callable[[int, Array], Array]:
-        def rate(j: int, y: Array) -> Array:
-            i = point + j
-            return _rate(y, steps.A[:, i], steps.W[:, i], steps.Q[:, i], steps.dW[:, :, i], steps.dQ[:, :, i])
-
-        return rate
-
-    centre = _runge_kutta(rate_from(0), ends[:, :-1], 0.5 * steps.h)
-    far = _runge_kutta(rate_from(4), centre, 0.5 * steps.h)
-    known = (ends[:, :-1], centre, ends[:, 1:])
-    slopes = [rate_from(i)(0, y) for i, y in zip((0, 4, 8), known, strict=True)]
-    values, derivatives = _quintic()
-    width = steps.h[:, None, None]
-    quarters = [
-        sum((a[i] * known[i] + width * b[i] * slopes[i] for i in range(3)), np.zeros(1))
-        for a, b in zip(values, derivatives, strict=True)
-    ]  # fmt: skip
-    return np.stack([known[0], quarters[0], known[1], quarters[1], known[2]], axis=2), far[0] - ends[0, 1:]
-
-
-def riccati_sweep(data: NodeData, final: Array) -> Sweep:
-    """Backward solution of the differential Riccati equation on the nodes of `data`, and of its tangents.
-
-    Parameters
-    ----------
-    data : NodeData
-        Coefficients; every segment has 4 k equal intervals, a node at a jump is stored twice.
-    final : ndarray, shape (1 + nw, n, n)
-        S at the last node, then its tangents.
-
-    Returns
-    -------
-    Sweep
-        The defect is the largest difference, over all steps and elements, between the swept S and two half steps of
-        the check program restarted from the sweep at the later end of that step; in the coordinates in which every
-        S_ii has the maximum 1 over time, so that it is relative and free of units.
-
-    Raises
-    ------
-    ModelError
-        A grid of another kind; a sweep that stays infinite at the finest spacing.
-
-    Notes
-    -----
-    A step whose defect exceeds 1e-9 is halved, on coefficients interpolated within its segment by polynomials of
-    degree five: a heavy terminal weight makes the loop fast near the end and only there.  The difference to
-    interpolation of degree three then counts as defect too.
-    """
-    start = blocks(data.t)[::-1, 0].astype(float)
-    steps = _placed(data, start, np.full(len(start), 4.0))
-    most = 16 * len(start) + 4096  # more halving than that is no stretch of fast motion but a problem without an answer
-    for attempt in range(LEVELS + 1):
-        with np.errstate(over="ignore", invalid="ignore"):
-            ends = _sweep(steps, final)
-            values, difference = _check(steps, ends)
-            sound = _sound(ends[0], values[0], difference)
-        scale = _scale(np.abs(np.diagonal(ends[0, : sound + 1], axis1=-2, axis2=-1)).max(axis=0))
-        defects = np.abs(difference[:sound] * scale[:, None] * scale).max(axis=(1, 2))
-        coarse = np.zeros(len(steps.h), dtype=bool)
-        coarse[:sound] = defects > TARGET
-        coarse[sound : sound + 1] = True
-        coarse &= steps.length > 4 * FINEST
-        if not coarse.any() or len(steps.h) > most:
-            break
-        if attempt < LEVELS:
-            steps = _placed(data, *_halved(steps, coarse))
-    if sound < len(steps.h):
-        raise ModelError(
-            f"riccati_sweep: the Riccati solution overflows near t = {np.interp(steps.begin[sound], np.arange(len(data.t)), data.t):.6g} s,"
-            " however small the step; a mode grows out of reach of the input, or the weights are too far apart: lower Qf or Q, or raise R"
-        )
-    at = _positions(steps.begin, steps.length, 5)
-    hit = at == np.round(at)
-    filled = np.empty((len(final), *data.A.shape))
-    filled[:, at[hit].astype(int)] = values[:, hit]
-    return Sweep(filled[0], filled[1:], max(float(defects.max()), _interpolation_error(data, steps, values[0], scale)), scale)
-
-
-def _sound(S: Array, values: Array, difference: Array) -> int:
-    """Number of steps before the first that is no answer at all: not finite, or half as large as S itself off its two half steps.
-
-    Such a step spoils all that follow it, whose defects then say nothing.
-    """
-    size = np.maximum.accumulate(np.abs(np.diagonal(S, axis1=-2, axis2=-1)), axis=0)[1:]
-    d = _scale(size)
-    wrong = ~(np.isfinite(values).all(axis=(1, 2, 3)) & (np.abs(difference * d[:, :, None] * d[:, None, :]).max(axis=(1, 2)) < 0.5))
-    return int(np.argmax(wrong)) if wrong.any() else len(wrong)
-
-
-def _scale(size: Array) -> Array:
-    """1/sqrt of a diagonal, one where it is zero."""
-    return np.asarray(1.0 / np.sqrt(np.where(size > np.finfo(float).tiny, size, 1.0)))
-
-
-def _halved(steps: _Steps, coarse: np.ndarray) -> tuple[Array, Array]:
-    """Begin and length of all steps with those marked cut in two, latest first."""
-    pieces = np.where(coarse, 2, 1)
-    length = np.repeat(steps.length / pieces, pieces)
-    later = np.zeros(len(length), dtype=bool)
-    later[np.cumsum(pieces)[coarse] - 2] = True
-    return np.repeat(steps.begin, pieces) + np.where(later, length, 0.0), length
-
-
-def _interpolation_error(data: NodeData, steps: _Steps, values: Array, scale: Array) -> float:
-    """Change of S over a halved step when coefficients are interpolated by cubics in place of quintics."""
-    cut = steps.length < 4.0
-    if not cut.any():
-        return 0.0
-    points = _positions(steps.begin[cut], steps.length[cut], 5)
-    matrix, count = _lagrange(data.t, points.ravel(), 4), int(cut.sum())
-    none = np.zeros((0, 1, 1, 1, 1))
-    S = values[cut][None]
-    A, W, Q = (_apply(matrix, v, count) for v in (data.A, data.W, data.Q))
-    coarse = _rate(S, A, W, Q, none, none)[0]
-    A, W, Q = (v[cut][:, ::2] for v in (steps.A, steps.W, steps.Q))
-    fine = _rate(S, A, W, Q, none, none)[0]
-    change = (coarse - fine) * steps.h[cut][:, None, None, None]
-    return float(np.abs(change * scale[:, None] * scale).max())
+def _at_points(steps: Steps, at: Flow, ends: Array, tangents: Array) -> tuple[Array, Array]:
+    """S (5, nb, n, n) and its tangents (nw, 5, nb, n, n) at the five points of each step."""
+    S = at.S + np.linspace(0.0, 1.0, 5)[:, None, None, None] * (ends[1:] - at.S[-1])
+    S[0], S[-1] = ends[:-1], ends[1:]
+    if not len(tangents):
+        return S, np.zeros((0, *S.shape))
+    n, drive, turned = S.shape[-1], tangent_drive(steps, at), np.swapaxes(at.inverse, -1, -2)
+    pushed = turned[-1] @ drive[:, -1] @ at.inverse[-1]
+    step, loop = _tangent_step(n), at.loop
+    start = np.array([_recursion(step, end, (loop,), push, steps.h)[:-1] for end, push in zip(tangents, pushed, strict=True)])
+    carried = start * at.d[:, :, None] * at.d[:, None, :]
+    return S, turned @ (carried[:, None] + drive) @ at.inverse

@@ -17,16 +17,18 @@ from numpy.typing import ArrayLike
 from scipy.integrate import DOP853
 from scipy.sparse import csr_array
 
-from models.core import Array, Model, ModelError, Var, as_vector, evaluate, frozen
+from models.core import Array, Model, ModelError, Var, as_scalar, as_vector, evaluate, frozen
 from ocp.coordinates import map_function
-from ocp.gains import UNCERTIFIED, Gains
+from ocp.gains import UNCERTIFIED, Certificate, Gains
 from ocp.methods import runge_kutta
-from ocp.riccati import matrix, positive_definite, positive_semidefinite
+from ocp.riccati import jacobi_scale, matrix, packed_places, positive_definite, positive_semidefinite
 from ocp.stops import Stop
+from ocp.tvlqr import CertificateError
 from ocp.tvlqr import certify as certified
 
 TABLEAU = (DOP853.A, DOP853.B, DOP853.C)
 GRADING = 1.5
+RESOLUTION = 1e-6  # of the nominal values: allowed difference between the ends found with the two kinds of steps
 POLISH = 8  # Newton steps on the stop time; quadratic, so that the last ones do not move it
 
 
@@ -45,15 +47,17 @@ class Tracker:
     states : tuple of Var
         What the gains multiply: the model's states, or the measured quantities.
     function : casadi.Function
-        (x0, u, p, Q, R_inverse, Qf), weights as upper triangles row by row -> (t_f, margin at t_f, Z, Zdot), latest node first:
+        (x0, u, p, Q, R_inverse, Qf), weights as upper triangles row by row -> (t_f, margin at t_f, resolution, Z, Zdot), latest node first:
         Z and Zdot (nx + nS + nu nx, steps + 1) hold states, upper triangle of S and gains (row by row), and their rates.
     half : casadi.Function
-        ([x; S], d) -> the same one step earlier, by two half steps, d = [h; u; p; Q; R_inverse]: the independent check.
+        ([x; S], d) -> (the same one step earlier, by two half steps; x and gains at half the step), d = [h; u; p; Q; R_inverse]: the
+        independent check.
     nodes : ndarray, shape (steps + 1,)
         Times of the sweep's nodes as parts of t_f.
     dense : tuple of ndarray and two csr_array
         Times (parts of t_f) of the gains, and the weights of node values and of t_f times the rates there: polynomials of degree 7
         through four neighbouring nodes.
+    middle : the same for the middles of the steps, where the check looks at the interpolation.
     """
 
     model: Model
@@ -66,6 +70,7 @@ class Tracker:
     half: ca.Function
     nodes: Array
     dense: tuple[Array, csr_array, csr_array]
+    middle: tuple[Array, csr_array, csr_array]
 
     def __call__(
         self, x0: ArrayLike, u: ArrayLike, *, Q: ArrayLike, R: ArrayLike, Qf: ArrayLike,
@@ -80,8 +85,9 @@ class Tracker:
         R : array_like, shape (nu, nu)
             Weight of the input, symmetric, > 0.
         certify : bool
-            Check every step of the sweep by an independent integration at half the step, from the swept S; without it
-            the certificate is ``UNCERTIFIED``.
+            Check every step of the sweep (flight and S) by an independent integration at half the step, and the interpolation between
+            nodes at its middle; ``riccati_residual`` is the largest of these defects, S and K relative to their largest values,
+            states to the larger of these and ``Var.nominal``.  Without it the certificate is ``UNCERTIFIED``.
 
         Returns
         -------
@@ -91,7 +97,8 @@ class Tracker:
         Raises
         ------
         ModelError
-            Bad weights or start, a stop that is not reached, no certificate.
+            Bad weights or start, a stop that is not reached, a flight that its steps do not resolve (search and sweep end apart
+            by more than 1e-6 of the nominal values), no certificate.
         """
         model, n = self.model, len(self.states)
         start, held = as_vector("x0", x0, model.states), as_vector("u", u, model.inputs)
@@ -100,7 +107,7 @@ class Tracker:
         q, qf = (positive_semidefinite(name, matrix(name, v, (n, n)), n) for name, v in (("Q", Q), ("Qf", Qf)))
         inverse: Array = np.linalg.inv(r).astype(np.float64)
         packed = [start, held, params, _upper(q), _upper(inverse), _upper(qf)]
-        t_f, margin, swept, rates = (v.full() for v in self.function.call([ca.DM(v) for v in packed]))
+        t_f, margin, resolution, swept, rates = (v.full() for v in self.function.call([ca.DM(v) for v in packed]))
         duration = float(t_f[0, 0])
         if not abs(float(margin[0, 0])) < 1e-9:
             limit = self.search * self.forward_steps
@@ -110,6 +117,11 @@ class Tracker:
             )
         if not (np.isfinite(swept).all() and np.isfinite(rates).all()):
             raise ModelError("tracker: NONFINITE: the sweep left the numbers; take more steps, or bring Q, Qf and R closer together")
+        if not float(resolution[0, 0]) <= RESOLUTION:
+            raise CertificateError(
+                f"tracker: the flight is not resolved: with the steps of the search and of the sweep its end differs by"
+                f" {float(resolution[0, 0]):.2g} of the nominal values, allowed is {RESOLUTION:g}; take a smaller search step or more steps"
+            )
         d = np.concatenate([held, params, packed[3], packed[4]])
         return self._gains(duration, held, params, d, swept.T[::-1], rates.T[::-1], certify)
 
@@ -121,25 +133,44 @@ class Tracker:
         x, S, K = z[:, :nx], _full(z[:, nx:n_z], nx), z[:, n_z:].reshape(len(t), nu, nx)
         proof = UNCERTIFIED
         if certify:
-            swept = _full(nodes[:, nx:n_z], nx)
-            scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diagonal(swept, axis1=1, axis2=2)).max(axis=0), np.finfo(float).tiny))
-            steps = np.column_stack([duration * np.diff(self.nodes), np.repeat(d[None], self.steps, axis=0)])
-            again = _full(evaluate(self.half, nodes[1:, :n_z], steps)[0][:, nx:], nx)
-            proof = certified(swept, float((np.abs(again - swept[:-1]) * scale[:, None] * scale).max()), scale)
+            proof = self._proof(duration, d, nodes, self.middle[1] @ nodes + duration * (self.middle[2] @ rates))
         x, S, K = self._measured(x, S, K, held, params)
         return Gains(t, K, np.zeros((len(t), nu)), S, x, np.repeat(held[None], len(t), axis=0), proof, self.states, self.model.inputs)
+
+    def _proof(self, duration: float, d: Array, nodes: Array, middle: Array) -> Certificate:
+        nx = len(self.model.states)
+        n_z = nx + nx * (nx + 1) // 2
+        S = _full(nodes[:, nx:n_z], nx)
+        scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diagonal(S, axis1=1, axis2=2)).max(axis=0), np.finfo(float).tiny))
+        size = np.maximum(np.abs(nodes[:, :nx]).max(axis=0), [v.nominal for v in self.model.states])
+        steps = np.column_stack([duration * np.diff(self.nodes), np.repeat(d[None], self.steps, axis=0)])
+        again, between = evaluate(self.half, nodes[1:, :n_z], steps)
+        largest = np.maximum(np.abs(nodes[:, n_z:]).max(axis=0), np.finfo(float).tiny)
+        defects = (
+            np.abs(_full(again[:, nx:], nx) - S[:-1]) * scale[:, None] * scale,
+            np.abs(again[:, :nx] - nodes[:-1, :nx]) / size,
+            np.abs(between[:, :nx] - middle[:, :nx]) / size,
+            np.abs(between[:, nx:] - middle[:, n_z:]) / largest,
+        )
+        own = jacobi_scale(S[:-1])
+        local = np.abs(_full(again[:, nx:], nx) - S[:-1]) * own[:, :, None] * own[:, None, :]
+        return certified(S, max(float(part.max()) for part in defects), scale, float(local.max()))
 
     def _measured(self, x: Array, S: Array, K: Array, held: Array, params: Array) -> tuple[Array, Array, Array]:
         if self.states == self.model.states:
             return x, S, K
         names = tuple(v.name for v in self.states)
         y, m, _ = evaluate(map_function(self.model, names), x, np.repeat(held[None], len(x), axis=0), params)
+        nominal = [np.array([v.nominal for v in variables]) for variables in (self.model.states, self.states)]
+        condition = np.linalg.cond(m * nominal[0] / nominal[1][:, None])
+        if not condition.max() < 1e14:
+            raise ModelError(f"tracker: SINGULAR: {names} do not determine the state everywhere along the flight; choose other quantities")
         inverse = np.linalg.inv(m)
         return y, np.swapaxes(inverse, 1, 2) @ S @ inverse, K @ inverse
 
 
 def tracker(
-    model: Model, *, until: Stop, steps: int = 72, refine: int = 8, search: float = 8.0, t_max: float = 1200.0,
+    model: Model, *, until: Stop, steps: int = 120, refine: int = 8, search: float = 8.0, t_max: float = 1200.0,
     measured: tuple[str, ...] | None = None,
 ) -> Tracker:  # fmt: skip
     """Build the function of a reference flight with its gains.
@@ -155,7 +186,7 @@ def tracker(
     refine : int
         Nodes of the gains for each step of the sweep.
     search : float
-        Step of the forward flight, s; also of order 8.
+        Step of the forward flight, s; also of order 8.  The stop is looked for at its ends: two crossings within one go unseen.
     t_max : float
         Longest flight, s.
     measured : tuple of str, optional
@@ -168,8 +199,13 @@ def tracker(
     """
     if len(until.conditions) != 1:
         raise ModelError(f"tracker: expected one stop condition, got {until.text()}; choose one")
-    if steps < 3 or refine < 1 or search <= 0 or t_max <= search:
-        raise ModelError(f"tracker: expected steps >= 3, refine >= 1 and 0 < search < t_max, got {steps}, {refine}, {search} and {t_max}")
+    for name, value, least in (("steps", steps, 3), ("refine", refine, 1)):
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            raise ModelError(f"tracker: {name}: expected a whole number, at least {least}, got {value!r}")
+    search, t_max = as_scalar("tracker: search", search), as_scalar("tracker: t_max", t_max)
+    if not 0 < search < t_max or t_max / search > 1e5:
+        raise ModelError(f"tracker: expected 0 < search < t_max <= 1e5 search, got search {search:g} s and t_max {t_max:g} s")
+    measured = None if measured is None else tuple(measured)
     names = measured or tuple(v.name for v in model.states)
     if len(names) != len(model.states):
         raise ModelError(f"tracker: measured: expected {len(model.states)} names, one for each state, got {len(names)}: {names}")
@@ -178,7 +214,7 @@ def tracker(
     function, half = _functions(model, until, steps, float(search), count, measured)
     known = {v.name: v for v in (*model.outputs, *model.states)}
     states = model.states if measured is None else tuple(known[n] for n in names)
-    return Tracker(model, until, float(search), count, steps, states, function, half, grid, _dense(steps, refine))
+    return Tracker(model, until, float(search), count, steps, states, function, half, grid, _dense(steps, refine), _dense(steps, 1, 0.5))
 
 
 @lru_cache(maxsize=16)
@@ -189,29 +225,37 @@ def _functions(
     n_s, n_r = nx * (nx + 1) // 2, nu * (nu + 1) // 2
     back, half, terminal, rates = _sweep_steps(model, measured)
     margin = _margin(model, until)
-    forward = _search_step(model, margin)
+    flow, forward = _forward_steps(model, margin)
     polish = _polish(model, margin, search)
 
     x0, u, p = ca.MX.sym("x0", nx), ca.MX.sym("u", nu), ca.MX.sym("p", n_p)
     q, r, qf = ca.MX.sym("Q", n_s), ca.MX.sym("R_inverse", n_r), ca.MX.sym("Qf", n_s)
     flown = forward.mapaccum(count)(ca.vertcat(x0, 0), ca.repmat(ca.vertcat(search, u, p), 1, count))[:, -1]
-    x_f, tau, left = polish(flown[:nx], ca.vertcat(u, p))
+    x_end, tau, left = polish(flown[:nx], ca.vertcat(u, p))
     t_f = search * flown[nx] + tau
+    # flown again on the sweep's own grid: each step back starts from these states, so that nothing grows backwards
+    lengths = t_f * ca.DM(np.diff(_graded(steps))).T
+    x = flow.mapaccum(steps)(x0, ca.vertcat(lengths, ca.repmat(ca.vertcat(u, p), 1, steps)))
+    resolution = ca.norm_inf((x[:, -1] - x_end) / ca.fmax(ca.fabs(x_end), ca.DM([v.nominal for v in model.states])))
     d = ca.vertcat(u, p, q, r)
-    z_f = terminal(x_f, qf, ca.vertcat(0, d))
-    lengths = ca.DM(np.diff(_graded(steps))[::-1]).T
-    z, seen = back.mapaccum(steps)(z_f, ca.vertcat(t_f * lengths, ca.repmat(d, 1, steps)))
-    first = rates(z[:, -1], ca.vertcat(0, d))
-    swept = ca.horzcat(ca.vertcat(ca.horzcat(z_f, z[:, :-1]), seen[: nu * nx, :]), ca.vertcat(z[:, -1], first[: nu * nx]))
+    latest = list(range(steps - 1, -1, -1))
+    S_f = terminal(x[:, -1], qf, ca.vertcat(0, d))
+    S, seen = back.mapaccum(steps)(S_f, ca.vertcat(x[:, latest], lengths[:, latest], ca.repmat(d, 1, steps)))
+    first = rates(ca.vertcat(x0, S[:, -1]), ca.vertcat(0, d))
+    states = ca.vertcat(ca.horzcat(x[:, latest], x0), ca.horzcat(S_f, S))
+    swept = ca.vertcat(states, ca.horzcat(seen[: nu * nx, :], first[: nu * nx]))
     changes = ca.horzcat(seen[nu * nx :, :], first[nu * nx :])
-    outputs = [t_f, left, ca.densify(swept), ca.densify(changes)]
+    outputs = [t_f, left, resolution, ca.densify(swept), ca.densify(changes)]
     arguments, names = [x0, u, p, q, r, qf], ["x0", "u", "p", "Q", "R_inverse", "Qf"]
-    whole = ca.Function(f"{model.name}_tracking", arguments, outputs, names, ["t_f", "margin", "Z", "Zdot"])
+    whole = ca.Function(f"{model.name}_tracking", arguments, outputs, names, ["t_f", "margin", "resolution", "Z", "Zdot"])
     return whole, half
 
 
 def _sweep_steps(model: Model, measured: tuple[str, ...] | None) -> tuple[ca.Function, ...]:
-    """Step back (z, d) -> (z, seen at the old z); the same by half steps -> z; end (x_f, Qf, d) -> z_f; seen (z, d) = [K; zdot; Kdot]."""
+    """Step back (S, [x; d]) -> (S, seen); the same by half steps, (z, d) -> (z, middle); end (x_f, Qf, d) -> S_f; seen (z, d).
+
+    z = [x; S], seen = [K; zdot; Kdot] at the node from which the step starts.
+    """
     nx, nu, n_p = len(model.states), len(model.inputs), len(model.params)
     n_s, n_r = nx * (nx + 1) // 2, nu * (nu + 1) // 2
     x, z, d = ca.SX.sym("x", nx), ca.SX.sym("z", nx + n_s), ca.SX.sym("d", 1 + nu + n_p + n_s + n_r)
@@ -232,15 +276,16 @@ def _sweep_steps(model: Model, measured: tuple[str, ...] | None) -> tuple[ca.Fun
         return ca.vec(ca.mtimes([inverse, linear(state[:nx], d)[2].T, _square(state[nx:], nx)]).T)
 
     whole = runge_kutta(rate, z, -h, ca.SX(0), 0.0, TABLEAU)
-    halves = runge_kutta(rate, runge_kutta(rate, z, -h / 2, ca.SX(0), 0.0, TABLEAU), -h / 2, ca.SX(0), 0.0, TABLEAU)
+    middle = runge_kutta(rate, z, -h / 2, ca.SX(0), 0.0, TABLEAU)
+    halves = runge_kutta(rate, middle, -h / 2, ca.SX(0), 0.0, TABLEAU)
     options = {"cse": True}
     qf = ca.SX.sym("qf", n_s)
-    end = ca.vertcat(x, _packed(ca.mtimes([M.T, _square(qf, nx), M])))
+    end = _packed(ca.mtimes([M.T, _square(qf, nx), M]))
     gains, z_rate = gain(z), rate(ca.SX(0), z)
     seen = ca.vertcat(gains, z_rate, ca.jtimes(gains, z, z_rate))
     return (
-        ca.Function(f"{model.name}_back", [z, d], [whole, seen], options),
-        ca.Function(f"{model.name}_back_half", [z, d], [halves], options),
+        ca.Function(f"{model.name}_back", [z[nx:], ca.vertcat(z[:nx], d)], [whole[nx:], seen], options),
+        ca.Function(f"{model.name}_back_half", [z, d], [halves, ca.vertcat(middle[:nx], gain(middle))], options),
         ca.Function(f"{model.name}_terminal", [x, qf, d], [end], options),
         ca.Function(f"{model.name}_seen", [z, d], [seen], options),
     )
@@ -252,14 +297,15 @@ def _margin(model: Model, until: Stop) -> ca.Function:
     return ca.Function("margin", [x, u, p], [until.expression(model, x, u, p)])
 
 
-def _search_step(model: Model, margin: ca.Function) -> ca.Function:
-    """([x; k], [H; u; p]) -> the same a step later, or unchanged where the step would cross the stop."""
+def _forward_steps(model: Model, margin: ca.Function) -> tuple[ca.Function, ca.Function]:
+    """Plain step (x, [h; u; p]) -> x; step of the search ([x; k], [H; u; p]) -> the same, unchanged where it would cross the stop."""
     nx, nu, n_p = len(model.states), len(model.inputs), len(model.params)
     c, d = ca.SX.sym("c", nx + 1), ca.SX.sym("d", 1 + nu + n_p)
     u, p = d[1 : 1 + nu], d[1 + nu :]
     ahead = runge_kutta(lambda _, x: model.rhs(x, u, p), c[:nx], d[0], ca.SX(0), 0.0, TABLEAU)
     flies_on = margin(ahead, u, p) > 0
-    return ca.Function("search", [c, d], [ca.vertcat(ca.if_else(flies_on, ahead, c[:nx]), c[nx] + flies_on)], {"cse": True})
+    plain = ca.Function("forward", [c[:nx], d], [ahead], {"cse": True})
+    return plain, ca.Function("search", [c, d], [ca.vertcat(ca.if_else(flies_on, ahead, c[:nx]), c[nx] + flies_on)], {"cse": True})
 
 
 def _polish(model: Model, margin: ca.Function, search: float) -> ca.Function:
@@ -282,7 +328,7 @@ def _polish(model: Model, margin: ca.Function, search: float) -> ca.Function:
 
 
 def _square(packed: ca.SX, n: int) -> ca.SX:
-    place = _places(n)
+    place = packed_places(n)
     return ca.reshape(packed[[int(i) for i in place.ravel()]], n, n) if n else ca.SX(0, 0)
 
 
@@ -291,19 +337,12 @@ def _packed(square: ca.SX) -> ca.SX:
     return ca.vertcat(*[square[i, j] for i in range(n) for j in range(i, n)])
 
 
-def _places(n: int) -> np.ndarray:
-    place = np.zeros((n, n), dtype=int)
-    rows, columns = np.triu_indices(n)
-    place[rows, columns] = place[columns, rows] = np.arange(len(rows))
-    return place
-
-
 def _upper(values: Array) -> Array:
     return np.asarray(values)[np.triu_indices(len(values))]
 
 
 def _full(packed: Array, n: int) -> Array:
-    return packed[:, _places(n)]
+    return packed[:, packed_places(n)]
 
 
 def _graded(steps: int) -> Array:
@@ -312,13 +351,16 @@ def _graded(steps: int) -> Array:
 
 
 @lru_cache(maxsize=16)
-def _dense(steps: int, refine: int) -> tuple[Array, csr_array, csr_array]:
-    """Times in [0, 1], `refine` to a step, and the weights of node values and rates there: confluent interpolation on four nodes."""
+def _dense(steps: int, refine: int, offset: float = 0.0) -> tuple[Array, csr_array, csr_array]:
+    """Times in [0, 1], `refine` to a step, and the weights of node values and rates there: confluent interpolation on four nodes.
+
+    With an offset the times lie at that part of every step instead, and the end is left out.
+    """
     grid = _graded(steps)
-    parts = (grid[:-1, None] + np.diff(grid)[:, None] * np.arange(refine) / refine).ravel()
-    times = np.append(parts, 1.0)
+    times = (grid[:-1, None] + np.diff(grid)[:, None] * (np.arange(refine) + offset) / refine).ravel()
     first = np.clip(np.repeat(np.arange(steps), refine) - 1, 0, steps - 3)
-    first = np.append(first, steps - 3)
+    if offset == 0.0:
+        times, first = np.append(times, 1.0), np.append(first, steps - 3)
     columns = first[:, None] + np.arange(4)
     width = grid[columns[:, 3]] - grid[columns[:, 0]]  # of each stencil: its unit, for the condition of the 8 by 8 systems
     nodes = (grid[columns] - grid[columns[:, :1]]) / width[:, None] - 0.5

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from models.core import Array, Model, ModelError, Status, as_finite, evaluate, frozen, unknown_name
-from models.drawing import new_figure
+from models.drawing import html_table, new_figure
 
 
 class SimulationError(ModelError):
@@ -124,16 +124,13 @@ class Trajectory:
         return f"Trajectory({self.model.name}: {len(self.t)} nodes, {self.t[0]:.6g} to {self.t[-1]:.6g} s, {self.status.name})"
 
     def _repr_html_(self) -> str:
-        rows = []
+        rows: list[tuple[str | float, ...]] = []
         for variables, values in ((self.model.states, self.x), (self.model.inputs, self.u), (self.model.outputs, self.y)):
             for i, var in enumerate(variables):
                 column = values[:, i]
-                numbers = (column[0], column[-1], column.min(), column.max())
-                cells = [html.escape(var.label), *(f"{v:.6g}" for v in numbers)]
-                rows.append("<tr>" + "".join(f"<td>{c}</td>" for c in cells) + "</tr>")
-        head = "".join(f"<th>{c}</th>" for c in ("", "first", "last", "least", "greatest"))
+                rows.append((var.label, column[0], column[-1], column.min(), column.max()))
         title = f"<b>{html.escape(self.model.name)}</b>: {len(self.t)} nodes, {self.t[0]:.6g} to {self.t[-1]:.6g} s, {self.status.name}"
-        return f"<div>{title}<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
+        return f"<div>{title}{html_table(('', 'first', 'last', 'least', 'greatest'), rows)}</div>"
 
     def plot(self, names: tuple[str, ...] | None = None) -> Any:
         """Small panels of the named columns (default: all states and inputs) against time; a matplotlib Figure."""

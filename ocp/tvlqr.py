@@ -13,8 +13,12 @@ from numpy.typing import ArrayLike
 from models.checked import Array, ModelError, as_finite, frozen
 from ocp.gains import Certificate, Gains
 from ocp.linearize import Linearization
-from ocp.riccati import ACCEPT, jacobi_scale, matrix, positive_definite, positive_semidefinite, symmetric
-from ocp.sweep import NodeData, riccati_sweep, run
+from ocp.riccati import ACCEPT, jacobi_scale, matrix, packed_places, positive_definite, positive_semidefinite, symmetric
+from ocp.sweep import riccati_sweep, run
+from ocp.sweep_flow import Dense
+from ocp.sweep_grid import Coefficients, NodeData
+
+LOCAL_ACCEPT = 1e-3  # largest local residual; sweeps aim at 1e-8 and report what they reach
 
 
 class CertificateError(ModelError):
@@ -96,14 +100,17 @@ def tvlqr(lin: Linearization, *, Q: ArrayLike, R: ArrayLike, Qf: ArrayLike) -> G
         # One more state, the constant 1, carries the defect: its Riccati row is s, and no second equation is needed.
         A, B, q, qf = (_bordered(v, rows, columns) for v, rows, columns in ((A, 1, 1), (B, 1, 0), (q, 1, 1), (qf, 1, 1)))
         A[:, :n, n] = lin.c
-    none = np.zeros((0, len(lin.t), 1, 1))
-    data = NodeData(lin.t, A, *_input_terms(B, r), np.broadcast_to(q, A.shape), none, none, none)
+    none = np.zeros((0, *A.shape))
+    data = NodeData(lin.t, Coefficients(A, *_input_terms(B, r), np.broadcast_to(q, A.shape), none, none))
     solution = riccati_sweep(data, qf[None])
     S = solution.S[:, :n, :n]
     gain = _solve(r, np.swapaxes(B, 1, 2) @ solution.S)
     k = gain[..., n] if affine else np.zeros(gain.shape[:2])
-    certificate = certify(S, solution.defect, solution.scale[:n])
-    return Gains(lin.t, gain[..., :n], k, S, lin.x0, lin.u0, certificate, lin.states, lin.inputs)
+    certificate = certify(S, solution.defect, solution.scale[:n], solution.local)
+    K, taken, flow = gain[..., :n], solution.steps, solution.flow
+    steps = (taken.begin[::-1], taken.length[::-1], taken.h[::-1])
+    between = Dense(lin.t, *steps, flow.powers[:, ::-1], solution.gap[::-1], B, r, K, k)
+    return Gains(lin.t, K, k, S, lin.x0, lin.u0, certificate, lin.states, lin.inputs, between)
 
 
 def _weights(lin: Linearization, Q: ArrayLike, R: ArrayLike, Qf: ArrayLike) -> tuple[Array, Array, Array]:
@@ -145,8 +152,8 @@ def _solve(r: Array, values: Array) -> Array:
     return np.moveaxis(solved.reshape(m, count, n), 1, 0)
 
 
-def certify(S: Array, residual: float, scale: Array) -> Certificate:
-    """Certificate of swept S (N, n, n), or CertificateError; `scale` (n,) makes the largest S_ii one."""
+def certify(S: Array, residual: float, scale: Array, local: float | None = None) -> Certificate:
+    """Certificate of swept S (N, n, n), or CertificateError; `scale` (n,) makes the largest S_ii one, `local` is the local residual."""
     ends = S[::-4] if len(S) > 64 else S  # every step of a long sweep, last node included; eigenvalues are the dear part
     low = float(np.linalg.eigvalsh(ends * scale[:, None] * scale).min())
     own = jacobi_scale(ends)
@@ -160,12 +167,17 @@ def certify(S: Array, residual: float, scale: Array) -> Certificate:
             f"no certificate: the Riccati defect is {residual:.3g}, allowed is {ACCEPT:g}; the closed loop or the reference"
             " changes too fast for these nodes: use finer nodes, or lower Qf and Q, or raise R"
         )
+    if local is not None and not local <= LOCAL_ACCEPT:
+        raise CertificateError(
+            f"no certificate: where S is small the Riccati defect is {local:.3g} of it, allowed is {LOCAL_ACCEPT:g}; the gains are wrong"
+            " there: use finer nodes, or lower Qf, or raise Q"
+        )
     if low < -1e-8:
         raise CertificateError(
             f"no certificate: S has the scaled eigenvalue {low:.3g}, expected >= 0; the weights span too many orders of"
             " magnitude for this horizon: bring Q, Qf and R closer together"
         )
-    return Certificate(residual, low, condition)
+    return Certificate(residual, low, condition, local_residual=local)
 
 
 def tvlqr_sensitivity(
@@ -208,12 +220,10 @@ def tvlqr_sensitivity(
     L, W = _input_terms(lin.B, r)
     solved = _solve(r, bt)
     dW = -np.swapaxes(solved, 1, 2) @ parts["R"] @ solved
-    # dL L^T + L dL^T = dW with dL = -1/2 B R^-1 dR C^-T, R = C C^T, L = B C^-T.
-    dL = -0.5 * np.swapaxes(solved, 1, 2) @ parts["R"] @ np.linalg.solve(r, np.linalg.cholesky(r))
-    data = NodeData(lin.t, lin.A, L, W, np.broadcast_to(q, lin.A.shape), dL, dW, parts["Q"])
+    data = NodeData(lin.t, Coefficients(lin.A, L, W, np.broadcast_to(q, lin.A.shape), dW, parts["Q"]))
     solution = riccati_sweep(data, np.concatenate([qf[None], parts["Qf"]]))
     K = _solve(r, bt @ solution.S)
-    certify(solution.S, solution.defect, solution.scale)
+    certify(solution.S, solution.defect, solution.scale, solution.local)
     dK = np.linalg.solve(r, bt @ solution.dS - parts["R"] @ K)
     return Sensitivity(lin.t, tuple(chosen), frozen(dK), frozen(weight))
 
@@ -237,10 +247,8 @@ def _entries(lin: Linearization, q: Array, r: Array, qf: Array) -> tuple[dict[st
 def _discrete_steps(n: int, m: int, count: int) -> ca.Function:
     size = n * (n + 1) // 2
     rows, columns = np.triu_indices(n)
-    place = np.zeros((n, n), dtype=int)
-    place[rows, columns] = place[columns, rows] = np.arange(size)
     z, d, h = ca.SX.sym("z", size), ca.SX.sym("d", 2 * n * n + n * m + m * m), ca.SX.sym("h")
-    S = ca.reshape(z[[int(i) for i in place.ravel()]], n, n)
+    S = ca.reshape(z[[int(i) for i in packed_places(n).ravel()]], n, n)
     A, B, Q, R = (ca.reshape(part, *shape) for part, shape in zip(
         ca.vertsplit(d, [0, n * n, n * n + n * m, 2 * n * n + n * m, 2 * n * n + n * m + m * m]),
         ((n, n), (n, m), (n, n), (m, m)), strict=True,

@@ -171,3 +171,65 @@ def test_samples_are_what_the_law_saw_and_did():
         assert taken.x[mine][order] == pytest.approx(one.x[at], rel=1e-11, abs=1e-11)
         assert taken.u[mine][order] == pytest.approx(one.u[at], rel=1e-11)
     assert ocp.simulate_ensemble(model, law, x0=x0, p=p, until=STOP).samples is None
+
+
+def test_a_case_outside_its_ranges_says_which_value():
+    model = models.entry_planar(CAPSULE)
+    x0, p = cases(model, 3)
+    x0[1, 1] = -1.5
+    p[2, model.index("wave_length")] = 10.0
+    flown = ocp.simulate_ensemble(model, ocp.constant(lift_ratio=0.15), x0=x0, p=p, until=STOP)
+    (first, second) = flown.failures()
+    assert first[0] == 1
+    assert "gamma = -1.5 rad is outside" in first[1]
+    assert second[0] == 2
+    assert "wave_length = 10 m is outside" in second[1]
+
+
+@pytest.mark.parametrize("wrong", [{"until": "h"}, {"law": None}, {"method": "RK4"}, {"model": "entry"}])
+def test_arguments_of_the_wrong_kind_are_named(wrong):
+    given = {"model": models.entry_planar(CAPSULE), "law": ocp.constant(lift_ratio=0.1), "until": STOP, "method": ocp.RK4(step=1.0)} | wrong
+    model, law = given.pop("model"), given.pop("law")
+    (name,) = wrong
+    for fly in (ocp.simulate, ocp.simulate_ensemble):
+        with pytest.raises(ModelError, match=f"simulate: {name}: expected"):
+            fly(model, law, x0=[7600.0, -0.025, 9e4, 0.0], **given)
+
+
+@pytest.mark.parametrize("law", laws(), ids=lambda law: law.name)
+@pytest.mark.parametrize("mode", ["accurate", "fast"])
+def test_compiled_code_gives_the_same_ends(law, mode):
+    model = models.entry_planar(CAPSULE)
+    x0, p = cases(model, 37)
+    x0[5, 1], x0[11, 1] = -1.5, 0.3  # outside its range; climbs away
+    p[17, model.index("rho_factor")] = 20.0
+    options = {"x0": x0, "p": p, "until": ocp.first_of(STOP, ocp.rises_above("h", 4e5)), "t_max": 900.0, "method": ocp.RK4(step=1.0)}
+    wanted = ocp.simulate_ensemble(model, law, native="off", **options)
+    found = ocp.simulate_ensemble(model, law, native=mode, **options)
+    assert found.status == wanted.status
+    assert {s.name for s in wanted.status} == {"OK", "OUT_OF_DOMAIN"}
+    rel = 1e-12 if mode == "accurate" else 1e-9
+    np.testing.assert_allclose(found.t, wanted.t, rtol=rel)
+    np.testing.assert_allclose(found.x, wanted.x, rtol=10 * rel, atol=1e-6 * rel)
+
+
+def test_compiled_code_keeps_failures_apart():
+    # the square root of a negative number ends one case; the others fly on
+    tank = define(
+        "tank", lambda x, u, p: {"level": -p.rate * ca.sqrt(x.level)}, states=[Var("level", valid=(0, 10))], params={Var("rate"): 1.0}
+    )
+    p = np.array([[1.0], [50.0], [0.5]])
+    options = {"x0": np.ones((3, 1)), "p": p, "until": ocp.falls_below("level", 0.25), "t_max": 5.0, "method": ocp.RK4(step=0.1)}
+    wanted = ocp.simulate_ensemble(tank, ocp.constant(), native="off", **options)
+    found = ocp.simulate_ensemble(tank, ocp.constant(), native="accurate", **options)
+    assert found.status == wanted.status
+    np.testing.assert_allclose(found.t, wanted.t, rtol=1e-12)
+
+
+def test_native_modes_that_cannot_be_are_refused():
+    model = models.entry_planar(CAPSULE)
+    x0, _ = cases(model, 2)
+    law = ocp.constant(lift_ratio=0.15)
+    for wrong in ({"native": "fast", "samples": True}, {"native": "accurate", "method": ocp.Adaptive()}, {"native": "yes"}):
+        with pytest.raises(ModelError, match="native"):
+            ocp.simulate_ensemble(model, law, x0=x0, until=STOP, **wrong)

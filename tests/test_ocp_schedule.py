@@ -64,6 +64,7 @@ def test_weights_decide_between_contradicting_samples() -> None:
     t, X, u = np.array([0.0, 1.0]), np.ones((2, 1)), np.array([1.0, 3.0])
     found = fit_commands(t, X, u, names=("k",), weight=[3.0, 1.0])
     assert found.K[0, 0] == pytest.approx(1.5, rel=1e-12)
+    assert found.residual == pytest.approx(np.sqrt((0.5**2 + 1.5**2) / 2), rel=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -74,6 +75,15 @@ def test_weights_decide_between_contradicting_samples() -> None:
         (lambda: time_means([0, 1], [[1, 2, 3], [3, 4, 5]], names=NAMES), "shape|values"),
         (lambda: time_means([1, 1], [[1, 2], [3, 4]], names=NAMES), "span"),
         (lambda: best_breakpoints([0, 1], [1, 2], pieces=1), "pieces"),
+        (lambda: best_breakpoints([0, 1], [1, 2], pieces=500), "pieces"),
+        (lambda: best_breakpoints([], [], pieces=2), "expected t"),
+        (lambda: best_breakpoints([0, 1], [1, 2, 3], pieces=2), "expected t"),
+        (lambda: best_breakpoints([2, 0, 1], [1, 2, 3], pieces=2), "sort"),
+        (lambda: best_breakpoints([1, 1], [1, 2], pieces=2), "span"),
+        (lambda: fit_commands([0, 1], [[1, 0], [2, 1]], [1, 2], names=NAMES, weight=[1, -1]), "negative"),
+        (lambda: fit_commands([0, 1], [[1, 0], [2, 1]], [1, 2], names=NAMES, weight=[1.0]), "weight"),
+        (lambda: Schedule(NAMES, 1.0, [[1, 2], [3, 4]], 0.0), "flat list"),
+        (lambda: Schedule(NAMES, [1.0], [[1, 2], [3, 4]], 0.0)([[1.0]]), "flatten"),
         (lambda: fit_commands([0, 1], [[1, 1], [2, 2]], [1, 2], names=NAMES), "SINGULAR"),
         (lambda: fit_commands([0, 1], [[1, 0], [2, 0]], [1, 2], names=NAMES), "SINGULAR.*b"),
         (lambda: fit_commands([0, 1], [[1, 0], [2, 1]], [1, 2, 3], names=NAMES), "u: expected"),
