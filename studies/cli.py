@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from studies import console
+from studies import cli_campaign, console
 from studies.console import Code, InputError
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ app = typer.Typer(
     help="Certified feedback gains for atmospheric entry: synthesis, dispersed closed loops, reports.",
     epilog="Exit codes: 0 done, 2 wrong input, 3 some cases failed, 4 machine (disk, permission, missing part), 130 interrupted.",
 )  # fmt: skip
+app.add_typer(cli_campaign.app)
 
 ScenarioFile = Annotated[
     Path | None,
@@ -98,10 +99,17 @@ def gains(
         study = request.scenario.run(dispersions=dispersions, at=times, progress=progress)
         data = study.to_dict()
     _write_gains(study, data, request)
+    for remark in study.remarks:
+        console.say(f"note: {remark}")
     if as_json:
         console.print_text(console.to_json(data))
     else:
         console.print_table(f"Gains of {request.scenario.vehicle.name}", ("quantity", "value", "unit"), study.summary())
+        from studies.gains_tables import gain_table, miss_table
+
+        tables = ([gain_table(study, times)] if times else []) + ([miss_table(study)] if study.closed_loop else [])
+        for table in tables:
+            console.print_table(table.title, table.columns, table.rows)
     _end(study.failed)
 
 
@@ -274,8 +282,11 @@ def _write_gains(study: Any, data: dict[str, Any], request: Request) -> None:
 
 
 def _drawn(figure: Figure, form: str) -> bytes:
+    from studies.figures import style
+
     stream = io.BytesIO()
-    figure.savefig(stream, format=form, dpi=150, bbox_inches="tight")
+    with style():  # colours are looked up when a figure is drawn
+        figure.savefig(stream, format=form, dpi=150, bbox_inches="tight")
     return stream.getvalue()
 
 

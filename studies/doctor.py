@@ -11,7 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 DISTRIBUTION = "reentry-workbench"
-_REQUIRED = ("casadi", "numpy", "scipy", "matplotlib", "osqp", "qpsolvers", "pydantic", "ruamel-yaml", "rich", "typer", "jinja2", "xarray")
+_REQUIRED = ("casadi", "numpy", "scipy", "matplotlib", "pydantic", "ruamel-yaml", "rich", "typer", "jinja2", "xarray")
+_PLANNED = ("osqp", "qpsolvers")  # installed with the workbench; nothing calls them before control allocation exists
 _OPTIONAL = {
     "control": "comparisons with python-control",
     "daqp": "a further quadratic-programming solver",
@@ -75,6 +76,10 @@ def _libraries() -> list[Check]:
         if name == "casadi" and found is not None and not found.startswith("3.8."):
             ok, detail = False, f"{found}; 3.8 is needed: pip install 'casadi>=3.8,<3.9'"
         checks.append(Check(name, ok, detail))
+    for name in _PLANNED:
+        found = _installed(name)
+        detail = f"{found}; for the planned control allocation, not used yet" if found else f"missing; install it with: pip install {name}"
+        checks.append(Check(name, found is not None, detail))
     for name, purpose in _OPTIONAL.items():
         found = _installed(name)
         checks.append(Check(name, True, found or f"absent; optional, for {purpose}"))
@@ -92,9 +97,9 @@ def _compiler() -> Check:
     names = [os.environ["CC"].split()[0]] if os.environ.get("CC", "").split() else ["cc", "gcc", "clang"]
     for name in names:
         if shutil.which(name):
-            return Check("C compiler", True, f"{os.path.basename(name)} found; exported flight code can be compiled here")
+            return Check("C compiler", True, f"{os.path.basename(name)} found; optional: every result is computed without it too")
     # not a fault: every number comes from the interpreter as well
-    return Check("C compiler", True, "none found; all results are computed by the interpreter, only compiled flight code is out of reach")
+    return Check("C compiler", True, "none found; optional: every result is computed by the interpreter")
 
 
 def _compare(found: float, known: float, tolerance: float, unit: str, source: str) -> tuple[bool, str]:

@@ -7,11 +7,12 @@ Source: Tang & Zhao 2000 (paper 003).  Gains are shown in the paper's sign, U = 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from models.core import Array, ModelError, as_finite
 from ocp.tvlqr import Sensitivity, tvlqr_sensitivity
@@ -35,6 +36,7 @@ class GainsStudy:
     peak: Mapping[str, float]
     closed_loop: Mapping[str, Mapping[str, Miss]]
     at: Array
+    remarks: tuple[str, ...] = ()
 
     @property
     def time_mean(self) -> dict[str, float | None]:
@@ -57,25 +59,27 @@ class GainsStudy:
             for number, reason in miss.failed
         ]
 
-    def certificate(self) -> dict[str, float]:
-        """The proofs of the synthesis, as plain numbers."""
+    def certificate(self) -> dict[str, float | None]:
+        """The proofs of the synthesis, as plain numbers; None where a condition number is infinite."""
         a, b, to = self.synthesis.guidance.certificate, self.synthesis.state.certificate, self.synthesis.to
         closed = terminal_gain(self.scenario, self.synthesis.lin)
-        return {
+        found = {
             "riccati_residual": a.riccati_residual,
             "min_eig_S": a.min_eig_S,
             "cond_S": a.cond_S,
             "riccati_residual_state_route": b.riccati_residual,
             "routes_difference": self.synthesis.routes_difference,
-            "terminal_gain_error": float(np.abs(self.synthesis.K[-1] - closed).max() / np.abs(closed).max()),
+            "terminal_gain_error": float(np.abs(self.synthesis.K_state_route[-1] - closed).max() / np.abs(closed).max()),
             "coordinate_condition_min": float(to.condition.min()),
             "coordinate_condition_max": float(to.condition.max()),
+            "step_s": self.synthesis.step,
         }
+        return {key: value if math.isfinite(value) else None for key, value in found.items()}
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able result."""
         reference = self.synthesis.reference
-        gains = np.asarray(self.synthesis.spline()(self.at))
+        gains = -self.synthesis.guidance.at(self.at).K[:, 0]
         closed = {
             group: {
                 name: {"rms_km": m.rms, "p95_km": m.p95, "max_km": m.worst, "arrived": len(m.km), "failed": len(m.failed)}
@@ -98,13 +102,15 @@ class GainsStudy:
             "certificate": self.certificate(),
             "sensitivity": sensitivity_table(self),
         }  # fmt: skip
+        if self.remarks:
+            result["remarks"] = list(self.remarks)
         if closed:
             result["closed_loop"] = closed
             result["failed"] = [{"flight": f, "case": n, "reason": r} for f, n, r in self.failed]
         return result
 
     def summary(self) -> list[tuple[str, float, str]]:
-        """Headline numbers as (label, value, unit)."""
+        """Headline numbers of the synthesis as (label, value, unit)."""
         reference, means = self.synthesis.reference, self.time_mean
         rows = [
             ("flight time", float(reference.t[-1]), "s"),
@@ -114,9 +120,12 @@ class GainsStudy:
         ]
         units = {"K1": "1/g0", "K2": "s/m", "K3a": "1/m", "K3b": "1/m", "K4": "s/m"}
         rows += [(f"mean {name}", value, units[name]) for name, value in means.items() if value is not None]
-        rows.append(("Riccati defect", self.certificate()["riccati_residual"], "1"))
-        for group, flights in self.closed_loop.items():
-            rows += [(f"{group}, {name}: rms miss", m.rms, "km") for name, m in flights.items() if len(m.km)]
+        proof = self.certificate()
+        rows += [
+            ("Riccati defect (certified)", proof["riccati_residual"] or 0.0, "1"),
+            ("smallest eigenvalue of scaled S", proof["min_eig_S"] or 0.0, "1"),
+            ("difference of the two routes", proof["routes_difference"] or 0.0, "1"),
+        ]
         return rows
 
     def figures(self) -> dict[str, Any]:
@@ -141,7 +150,7 @@ def sensitivity_table(study: GainsStudy) -> dict[str, dict[str, float]]:
     }  # fmt: skip
 
 
-def run(scenario: Scenario, *, dispersions: int = 0, at: Sequence[float] | None = None, progress: Progress | None = None) -> GainsStudy:
+def run(scenario: Scenario, *, dispersions: int = 0, at: ArrayLike | None = None, progress: Progress | None = None) -> GainsStudy:
     """Synthesize the gains of a scenario and, on request, fly dispersed cases.
 
     Parameters
@@ -149,7 +158,7 @@ def run(scenario: Scenario, *, dispersions: int = 0, at: Sequence[float] | None 
     scenario : Scenario
     dispersions : int
         Cases in each set; 0 for none.
-    at : sequence of float, optional
+    at : array_like, shape (M,), optional
         Times at which the gains are reported, s, inside the reference flight; default: all nodes.
     progress : callable, optional
         ``progress(label, fraction)``.
@@ -159,12 +168,14 @@ def run(scenario: Scenario, *, dispersions: int = 0, at: Sequence[float] | None 
     ModelError
         The reference does not reach its stop altitude, a time outside the flight, no certificate.
     """
-    if dispersions < 0:
-        raise ModelError(f"dispersions: expected 0 or more cases, got {dispersions}")
+    if isinstance(dispersions, bool) or not isinstance(dispersions, int) or dispersions < 0:
+        raise ModelError(f"dispersions: expected a whole number of cases, 0 or more, got {dispersions!r}")
     synthesis = certified(scenario)
     reference = synthesis.reference
     nodes = reference.t[np.concatenate([[True], np.diff(reference.t) > 0])]
-    times = nodes if at is None else np.atleast_1d(as_finite("at", list(at)))
+    times = nodes if at is None else np.atleast_1d(as_finite("at", at))
+    if times.ndim != 1:
+        raise ModelError(f"at: expected times of shape (M,), got {times.shape}; give a flat list")
     if times.size == 0:
         raise ModelError("at: the list of times is empty; give at least one time, or leave it out for all nodes")
     if times.min() < 0 or times.max() > reference.t[-1]:
@@ -172,5 +183,13 @@ def run(scenario: Scenario, *, dispersions: int = 0, at: Sequence[float] | None 
         raise ModelError(f"at: {bad:.9g} s is outside the reference flight [0, {reference.t[-1]:.9g}] s; choose times inside it")
     Q, R, F = weights(scenario)
     sensitivity = tvlqr_sensitivity(synthesis.lin, Q=Q, R=R, Qf=F)
-    flown = schedules.fly_dispersed(scenario, synthesis, dispersions, progress) if dispersions else {}
-    return GainsStudy(scenario, synthesis, sensitivity, peaks(reference), flown, times)
+    remarks = list(synthesis.remarks)
+    if np.abs(reference["gamma"]).max() > 0.5 * math.pi:
+        remarks.append(
+            "the reference flies past the vertical, where a planar entry with trimmed lift means little; raise the stop altitude"
+        )
+    flown: dict[str, dict[str, Miss]] = {}
+    if dispersions:
+        flown, more = schedules.fly_dispersed(scenario, synthesis, dispersions, progress)
+        remarks += more
+    return GainsStudy(scenario, synthesis, sensitivity, peaks(reference), flown, times, tuple(remarks))

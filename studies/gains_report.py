@@ -1,4 +1,4 @@
-"""Figures, tables and *paper | computed* rows of the gain study."""
+"""Figures of the gain study, and all that the report shows of it."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from studies import figures as fig
-from studies.guidance import MEASURED
-from studies.result import Comparison, FigureItem, Headline, StudyResult, Table
+from studies.gains_tables import LABELS, certificate_table, comparisons, gain_table, is_n1, miss_table, reference_table, sensitivity_table
+from studies.result import FigureItem, Headline, StudyResult
 
 if TYPE_CHECKING:
     from studies.gains import GainsStudy
@@ -21,44 +21,51 @@ PANELS = (
     ("K3", "$K_3$ [10$^{-5}$ 1/m]", 1e5),
     ("K4", "$K_4$ [10$^{-3}$ s/m]", 1e3),
 )
-LABELS = {
-    "open_loop": "open loop",
-    "time_varying": "K(t)",
-    "least_squares": "constants fitted to flown commands, K3 split",
-    "time_mean": "time means of K(t), K3 split",
-    "paper": "printed constants",
-    "paper_unsplit": "printed constants, K3 unsplit",
-}
+
+SEARCHED = (
+    "The reference flight was found by a search so that the computed gains meet the printed ones: it does not identify"
+    " the authors' vehicle."
+)
+OTHER = (
+    "This scenario is not reference N1, for which the computed gains meet the printed ones: the printed constants belong to another flight."
+)
 
 
 def result(study: GainsStudy) -> StudyResult:
     """Everything the report shows of the study."""
-    tables = [gain_table(study), certificate_table(study), sensitivity_table(study)]
+    tables = [reference_table(study), gain_table(study), certificate_table(study), sensitivity_table(study)]
     if study.closed_loop:
-        tables.insert(1, miss_table(study))
-    means = study.time_mean
-    headlines = [
-        Headline("mean K1", float(means["K1"] or 0.0), "1/g0", "printed -0.62"),
-        Headline("Riccati defect", study.certificate()["riccati_residual"], "", "independent, half step", 2),
-        Headline("routes differ by", study.synthesis.routes_difference, "", "guidance against state coordinates", 2),
-    ]
-    for name, flights in study.closed_loop.items():
-        if name == "large" and len(flights["time_varying"].km):
-            headlines.append(
-                Headline("rms miss, K(t)", flights["time_varying"].rms, "km", f"open loop {flights['open_loop'].rms:.0f} km", 3)
-            )
+        tables.insert(2, miss_table(study))
     return StudyResult(
         name="gains",
         title="Optimal feedback gains of longitudinal entry guidance",
         lead=(
             "Tang and Zhao (2000) derive the feedback gains of capsule entry guidance from a Riccati equation along the reference flight. "
             "Here the perturbation model comes from the symbolic Jacobians of the equations of motion, in measured coordinates "
-            "(axial load, altitude rate, downrange, downrange rate) and, as a check, in state coordinates. The reference flight was found "
-            "by a search so that the computed gains meet the printed ones: it does not identify the authors' vehicle."
+            "(axial load, altitude rate, downrange, downrange rate: X = M dx, with M the Jacobian of the measured quantities) and, "
+            "as a check, in state coordinates: the two routes must give the same gains. S is the solution of the Riccati equation; "
+            "a quantity is called scaled when its rows and columns are divided by typical magnitudes. "
+            + (SEARCHED if is_n1(study) else OTHER)
         ),
         figures=figures(study), tables=tables, comparisons=comparisons(study),
-        data=study.to_dict(), failed=study.failed, headlines=headlines,
+        data=study.to_dict(), failed=study.failed, headlines=headlines(study),
     )  # fmt: skip
+
+
+def headlines(study: GainsStudy) -> list[Headline]:
+    """The cards of the study."""
+    printed, proof = study.scenario.guidance.paper_gains, study.certificate()
+    cards = [
+        Headline("Flight time", float(study.synthesis.reference.t[-1]), "s", "of the reference"),
+        Headline("Mean K1", float(study.time_mean["K1"] or 0.0), "1/g0", f"printed {printed.K1:g}".replace("-", "−")),
+        Headline("Riccati defect", proof["riccati_residual"] or 0.0, "", "against an integration at half the step", 2),
+        Headline("Routes differ by", proof["routes_difference"] or 0.0, "", "measured against state coordinates", 2),
+    ]
+    large = study.closed_loop.get("large")
+    if large is not None and len(large["time_varying"].km) and len(large["open_loop"].km):
+        note = f"set large, {len(large['time_varying'].km)} cases; open loop {large['open_loop'].rms:.0f} km"
+        cards.append(Headline("Rms range error, K(t)", large["time_varying"].rms, "km", note, 3))
+    return cards
 
 
 def figures(study: GainsStudy) -> list[FigureItem]:
@@ -66,8 +73,9 @@ def figures(study: GainsStudy) -> list[FigureItem]:
     makers: list[tuple[str, str, str, Callable[[GainsStudy], Any]]] = [
         (
             "gains", "Feedback gains along the reference",
-            "Gains K(t) of the Riccati equation (paper's sign, ungated), their time means (K3 split) and the printed constants. "
-            "The printed constants are the time means of K(t).", gain_figure,
+            "Gains K(t) of the Riccati equation (paper's sign, ungated), their time means (K3 split) and the printed constants."
+            + ("" if any(row.met is False for row in comparisons(study)) else " The printed constants lie within 3 % of the time means."),
+            gain_figure,
         ),
         (
             "reference", "Reference flight",
@@ -76,18 +84,19 @@ def figures(study: GainsStudy) -> list[FigureItem]:
         (
             "sensitivity", "Sensitivity of the gains to the weights",
             "Time mean of |dK/d ln(weight)| over the time mean of |K|, exact, from the derivative of the Riccati solution. "
-            "The downrange weight in Q acts about as strongly as R.", sensitivity_figure,
+            "Entries that show no bar are below 0.001 to 0.01.", sensitivity_figure,
         ),
         (
             "coordinates", "Conditioning and agreement of the two routes",
-            "Condition number of the scaled map from states to measured coordinates (left), and difference of the gains found in the "
-            "two coordinates relative to the largest magnitude of each gain (right).", coordinates_figure,
+            "Condition number of the scaled map from states to measured coordinates (a), and difference of the gains found in the "
+            "two coordinates relative to the largest magnitude of each gain (b).", coordinates_figure,
         ),
     ]  # fmt: skip
     if study.closed_loop:
         makers.insert(1, (
             "misses", "Range errors of the dispersed flights",
-            "Share of the cases with a range error below the abscissa; the same cases under every schedule.", miss_figure,
+            "Share of the cases with a range error below the abscissa; the same cases under every schedule. "
+            "Printed constants and time means lie on one another for reference N1.", miss_figure,
         ))  # fmt: skip
     items = []
     for name, title, caption, make in makers:
@@ -122,7 +131,7 @@ def gain_figure(study: GainsStudy) -> Any:
 
 def reference_figure(study: GainsStudy) -> Any:
     """Reference flight in four panels."""
-    figure, axes = fig.small_multiples(["corridor", "load", "path angle", "range"], cols=2, panel_height_mm=46)
+    figure, axes = fig.small_multiples(["altitude and speed", "load", "path angle", "range"], cols=2, panel_height_mm=46)
     r = study.synthesis.reference
     axes[0].plot(r["V"] / 1e3, r["h"] / 1e3)
     axes[0].set(xlabel="speed [km/s]", ylabel="altitude [km]")
@@ -139,7 +148,7 @@ def reference_figure(study: GainsStudy) -> Any:
 
 def miss_figure(study: GainsStudy) -> Any:
     """Distribution of |range error| for each set and schedule."""
-    figure, axes = fig.small_multiples([name.replace("_", " + ") for name in study.closed_loop], cols=3, panel_height_mm=58, sharey=True)
+    figure, axes = fig.small_multiples(list(study.closed_loop), cols=3, panel_height_mm=58, sharey=True)
     for axis, flights in zip(axes, study.closed_loop.values(), strict=False):
         for i, (schedule, miss) in enumerate(flights.items()):
             if len(miss.km) == 0:
@@ -150,6 +159,7 @@ def miss_figure(study: GainsStudy) -> Any:
             axis.step(np.maximum(ordered, 1e-4), 100 * share, style, where="post", color=f"C{i}", label=LABELS[schedule])
         axis.set_xscale("log")
         axis.set_xlim(1e-2, 1e3)
+        axis.set_xticks([1e-2, 1e-1, 1e0, 1e1, 1e2, 1e3])
         axis.set_xlabel("range error [km]")
     axes[0].set_ylabel("share of the cases [%]")
     handles, labels = axes[0].get_legend_handles_labels()
@@ -165,8 +175,10 @@ def sensitivity_figure(study: GainsStudy) -> Any:
     for j, (gain, _, _) in enumerate(PANELS):
         heights = [row[gain] for row in table.values()]
         axis.bar(np.arange(len(table)) + (j - 1.5) * width, heights, width, label=f"$K_{gain[1]}$", color=f"C{j}")
-    axis.set_xticks(range(len(table)), [_weight_label(name) for name in table])
-    axis.set_ylabel("relative change of the gain")
+    axis.set_xticks(range(len(table)), [_weight_label(name) for name in table], va="baseline")
+    axis.tick_params(axis="x", pad=11)
+    axis.set_ylabel("relative sensitivity of the gain [1]")
+    axis.grid(visible=False, axis="x")
     axis.legend(ncols=4, loc="upper right")
     return figure
 
@@ -187,88 +199,7 @@ def coordinates_figure(study: GainsStudy) -> Any:
     for i, (name, _, _) in enumerate(PANELS):
         shown = difference[:, i] > 1e-15  # both routes share the end point exactly
         axes[1].semilogy(s.to.t[shown], difference[shown, i], label=f"$K_{name[1]}$", color=f"C{i}")
-    axes[1].set(xlabel="time [s]", ylabel="difference of the routes")
+    axes[1].set(xlabel="time [s]", ylabel="relative difference [1]")
     axes[1].set_ylim(1e-15, None)
     axes[1].legend(ncols=4, loc="lower center")
     return figure
-
-
-def gain_table(study: GainsStudy) -> Table:
-    """Gains at a few times."""
-    end = float(study.synthesis.reference.t[-1])
-    times = [t for t in (0.0, 50.0, 100.0, 200.0, 300.0, 400.0, 450.0, 500.0) if t < end] + [end]
-    values = study.synthesis.spline()(times)
-    rows = [[t, *(float(v) for v in row)] for t, row in zip(times, values, strict=True)]
-    return Table(
-        "Feedback gains K(t)", ["time [s]", "K1 [1/g0]", "K2 [s/m]", "K3 [1/m]", "K4 [s/m]"], rows,
-        "Sign of the paper: correction of CL/CD cos(bank) = K1 dn_x + K2 dhdot + K3 ds + K4 dsdot.",
-    )  # fmt: skip
-
-
-def miss_table(study: GainsStudy) -> Table:
-    """rms, 95th percentile and maximum of the range error."""
-    rows: list[list[Any]] = []
-    for name, flights in study.closed_loop.items():
-        for schedule, m in flights.items():
-            numbers = [m.rms, m.p95, m.worst] if len(m.km) else [None, None, None]
-            rows.append([name, LABELS[schedule], *numbers, len(m.km), len(m.failed)])
-    seed = study.scenario.dispersions.seed
-    return Table(
-        "Range errors of the dispersed closed loops",
-        ["set", "schedule", "rms [km]", "95 % [km]", "largest [km]", "arrived", "failed"], rows,
-        f"Independent uniform dispersions, seed {seed}, command every {study.scenario.guidance.sample_s:g} s, feedback above "
-        f"{study.scenario.guidance.gate_load_g:g} g0, perfect navigation. A few cases in which the lift saturates dominate the rms "
-        "of the constants.",
-    )  # fmt: skip
-
-
-def certificate_table(study: GainsStudy) -> Table:
-    """The proofs of the synthesis."""
-    c = study.certificate()
-    rows: list[list[Any]] = [
-        [
-            "Riccati defect, guidance coordinates",
-            c["riccati_residual"],
-            "per interval, against an independent integration at half the step",
-        ],
-        ["Riccati defect, state coordinates", c["riccati_residual_state_route"], "the same for the second route"],
-        ["difference of the two routes", c["routes_difference"], "relative to the largest magnitude of each gain"],
-        ["terminal gain against its closed form", c["terminal_gain_error"], "K(t_f) = -R⁻¹H'F"],
-        ["smallest eigenvalue of scaled S", c["min_eig_S"], "must not be negative"],
-        ["condition number of scaled S", c["cond_S"], "worst node"],
-        ["condition number of scaled M", c["coordinate_condition_max"], "worst node; singular only where the load or the speed vanishes"],
-    ]
-    return Table("Certificate of the synthesis", ["proof", "value", "meaning"], rows)
-
-
-def sensitivity_table(study: GainsStudy) -> Table:
-    """Relative sensitivities."""
-    rows: list[list[Any]] = []
-    for name, row in study.to_dict()["sensitivity"].items():
-        rows.append([name, *row.values()])
-    return Table(
-        "Relative sensitivity of the gains to the weights", ["weight", "K1", "K2", "K3", "K4"], rows,
-        "Time mean of |dK/d ln(weight)| over the time mean of |K|. The paper finds K insensitive to F and Q; along this reference "
-        f"the {MEASURED[2]} entries of Q and F are not negligible beside R.",
-    )  # fmt: skip
-
-
-def comparisons(study: GainsStudy) -> list[Comparison]:
-    """Printed constants beside the computed time means."""
-    printed, means = study.scenario.guidance.paper_gains, study.time_mean
-    units = {"K1": "1/g0", "K2": "s/m", "K3a": "1/m", "K3b": "1/m", "K4": "s/m"}
-    split = study.scenario.guidance.split_s
-    words = {"K3a": f", t < {split:g} s", "K3b": f", t ≥ {split:g} s"}
-    rows = []
-    for key, unit in units.items():
-        value = means[key]
-        if value is not None:
-            why = "time mean of K(t); printed to two digits, along the authors' own unpublished reference"
-            rows.append(Comparison(f"{key[:2]}{words.get(key, '')}", float(getattr(printed, key)), value, unit, why, 0.03))
-    sensitivity = study.to_dict()["sensitivity"]
-    strongest = max((max(row.values()), name) for name, row in sensitivity.items() if name.startswith("Q["))
-    rows.append(Comparison(
-        "sensitivity to Q relative to R", "“not very sensitive”", strongest[0] / max(sensitivity["R[lift_ratio]"].values()), "1",
-        f"largest relative sensitivity to an entry of Q ({strongest[1]}) over that to R: not small along this reference", None,
-    ))  # fmt: skip
-    return rows

@@ -168,10 +168,13 @@ class Comparison:
 
     @property
     def difference(self) -> float | None:
-        """Relative difference ``(computed - paper)/|paper|``, signed; None without a printed number or with a printed zero."""
+        """Relative difference ``(computed - paper)/paper``: positive where the magnitude is larger.
+
+        None without a printed number or with a printed zero.
+        """
         if self.paper is None or isinstance(self.paper, str) or self.paper == 0:
             return None
-        return (self.computed - self.paper) / abs(self.paper)
+        return (self.computed - self.paper) / self.paper
 
     @property
     def met(self) -> bool | None:

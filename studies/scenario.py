@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import ConfigDict, Field, ValidationError
 
 from studies.scenario_errors import locate, nested_key, translate
-from studies.scenario_sections import Atmosphere, Dispersions, Guidance, Numerics, Planet, Reference, Section, Vehicle, Weights
+from studies.scenario_sections import Atmosphere, Campaign, Dispersions, Guidance, Numerics, Planet, Reference, Section, Vehicle, Weights
 from studies.scenario_text import Place, ScenarioError, parse_text, parse_value, read_text
 
 if TYPE_CHECKING:
@@ -46,6 +46,7 @@ class Scenario(Section):
     guidance: Guidance = Field(default=Guidance(), description="how the gains are flown")
     dispersions: Dispersions = Field(default=Dispersions(), description="dispersed closed-loop flights")
     numerics: Numerics = Field(default=Numerics(), description="accuracy")
+    campaign: Campaign = Field(default=Campaign(), description="a campaign of many dispersed flights (reentry campaign)")
 
     @classmethod
     def default(cls) -> Scenario:

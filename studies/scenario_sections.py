@@ -159,7 +159,7 @@ class DispersionSet(Section):
     lift: Real = _half_width("lift coefficient, fraction", 0.9, remedy=_FRACTION)
     wave_amplitude: Real = _half_width("density wave along altitude, fraction (its phase is uniform)", 0.9, remedy=_FRACTION)
     wave_length_m: Real = Field(
-        ge=100.0, le=1e6, description="wave length of that wave (not a half-width)", json_schema_extra={"remedy": "in metres"}
+        ge=1000.0, le=1e6, description="wave length of that wave (not a half-width)", json_schema_extra={"remedy": "in metres"}
     )
 
 
@@ -203,3 +203,64 @@ class Numerics(Section):
     """Accuracy."""
 
     step_s: Real = _key(0.5, "integration step", 0.01, 5.0)
+
+
+_SPREAD = "half-width of a uniform law, standard deviation of a normal one"
+Law = Literal["uniform", "normal"]
+_LAW: Any = Field(default="uniform", description="uniform, or normal")
+
+
+class PathAngleLaw(Section):
+    """Law of the flight-path angle at entry."""
+
+    law: Law = _LAW
+    spread: Real = _key(_LARGE.path_angle_deg, _SPREAD, 0.0, 5.0, remedy="in degrees")
+
+
+class SpeedLaw(Section):
+    """Law of the speed at entry."""
+
+    law: Law = _LAW
+    spread: Real = _key(_LARGE.speed_m_s, _SPREAD, 0.0, 1000.0, remedy="in m/s")
+
+
+class DensityLaw(Section):
+    """Law of the density, as a fraction of the model's."""
+
+    law: Law = _LAW
+    spread: Real = _key(_LARGE.density, _SPREAD, 0.0, 0.9, remedy=_FRACTION)
+
+
+class CoefficientLaw(Section):
+    """Law of an aerodynamic coefficient, as a fraction of the vehicle's."""
+
+    law: Law = _LAW
+    spread: Real = _key(_LARGE.drag, _SPREAD, 0.0, 0.9, remedy=_FRACTION)
+
+
+class Distributions(Section):
+    """What is dispersed in a campaign, and how; the defaults are those of the set `large`."""
+
+    path_angle_deg: PathAngleLaw = Field(default=PathAngleLaw(), description="flight-path angle at entry, degrees")
+    speed_m_s: SpeedLaw = Field(default=SpeedLaw(), description="speed at entry, m/s")
+    density: DensityLaw = Field(default=DensityLaw(), description="density, fraction")
+    drag: CoefficientLaw = Field(default=CoefficientLaw(), description="drag coefficient, fraction")
+    lift: CoefficientLaw = Field(default=CoefficientLaw(), description="lift coefficient, fraction")
+    wave_amplitude: Real = _key(0.0, "density wave along altitude, fraction (its phase is uniform)", 0.0, 0.9, remedy=_FRACTION)
+    wave_length_m: Real = _key(30000.0, "wave length of that wave", 1000.0, 1e6, remedy="in metres")
+
+
+class Campaign(Section):
+    """Many dispersed flights of one study, computed in chunks that survive an interruption."""
+
+    study: Literal["gains"] = Field(default="gains", description="the study whose guidance is flown")
+    schedule: Literal["open_loop", "time_varying", "least_squares", "time_mean", "paper", "paper_unsplit"] = Field(
+        default="time_varying", description="gain schedule that is flown"
+    )
+    cases: int = Field(default=10000, strict=True, ge=1, le=10**8, description="number of flights")
+    chunk: int = Field(default=1000, strict=True, ge=1, le=10**6, description="flights computed and stored together")
+    design: Literal["independent", "latin_hypercube", "sobol"] = Field(
+        default="independent", description="independent draws, latin_hypercube, or sobol (scrambled; best with a power of two of cases)"
+    )
+    seed: int = Field(default=20000503, strict=True, ge=0, le=2**53, description="seed of the draws")
+    distributions: Distributions = Field(default=Distributions(), description="laws of the dispersed quantities")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from models.core import Array, evaluate
+from models.core import Array, ModelError, evaluate
 from ocp.laws import Law
 from ocp.methods import RK4
 from ocp.schedule import Schedule, fit_commands, time_means
@@ -41,20 +41,24 @@ def means(scenario: Scenario, synthesis: Synthesis) -> Schedule:
     return time_means(t, synthesis.K, names=MEASURED, breakpoints=split_of(scenario, float(t[-1])))
 
 
-def plans(scenario: Scenario, synthesis: Synthesis, onward: Trajectory) -> dict[str, GainsAt]:
-    """The gain schedules that are flown, by name; `onward` is the reference continued below its end."""
+def plans(scenario: Scenario, synthesis: Synthesis, onward: Trajectory) -> tuple[dict[str, GainsAt], list[str]]:
+    """The gain schedules that are flown, by name, and remarks; `onward` is the reference continued below its end."""
     printed, split = scenario.guidance.paper_gains, np.array([scenario.guidance.split_s])
     early = np.array([printed.K1, printed.K2, printed.K3a, printed.K4])
     late = np.array([printed.K1, printed.K2, printed.K3b, printed.K4])
     none, two = np.zeros(0), np.array([early, late])
-    return {
+    schedules: dict[str, GainsAt] = {
         "open_loop": Schedule(MEASURED, none, np.zeros((1, 4)), 0.0),
         "time_varying": guidance.interpolated(synthesis.reference.t, synthesis.K),
-        "least_squares": fitted(scenario, synthesis, onward),
         "time_mean": means(scenario, synthesis),
         "paper": Schedule(MEASURED, split, two, 0.0) if split[0] > 0 else Schedule(MEASURED, none, late[None], 0.0),
         "paper_unsplit": Schedule(MEASURED, none, early[None], 0.0),
     }
+    try:
+        schedules["least_squares"] = fitted(scenario, synthesis, onward)
+    except ModelError as error:
+        return schedules, [f"no constants are fitted to flown commands: {error}"]
+    return schedules, []
 
 
 def fitted(scenario: Scenario, synthesis: Synthesis, onward: Trajectory) -> Schedule:
@@ -76,11 +80,13 @@ def fitted(scenario: Scenario, synthesis: Synthesis, onward: Trajectory) -> Sche
     )  # fmt: skip
     taken = flown.samples
     if taken is None:
-        return means(scenario, synthesis)
+        raise ModelError("none of the training flights could be flown")
     measured = measurements(reference, taken.x, p[taken.case])
     deviation = measured - guidance.measured_reference(onward)(taken.t)
     command = (varying(taken.t) * deviation).sum(axis=1)
     used = np.abs(measured[:, 0]) >= g.gate_load_g
+    if np.count_nonzero(used) < 2:
+        raise ModelError(f"the training flights hardly reach {g.gate_load_g:g} g0 (guidance.gate_load_g)")
     return fit_commands(taken.t[used], deviation[used], command[used], names=MEASURED, breakpoints=split_of(scenario, end))
 
 
@@ -111,12 +117,14 @@ def half_widths(half: DispersionSet) -> dict[str, float]:
     }  # fmt: skip
 
 
-def fly_dispersed(scenario: Scenario, synthesis: Synthesis, cases: int, progress: Progress | None) -> dict[str, dict[str, Miss]]:
-    """All sets under all schedules; the same cases for every schedule."""
+def fly_dispersed(
+    scenario: Scenario, synthesis: Synthesis, cases: int, progress: Progress | None
+) -> tuple[dict[str, dict[str, Miss]], list[str]]:
+    """All sets under all schedules, the same cases for every schedule; and remarks."""
     reference = synthesis.reference
     onward = guidance.continued(reference, flight_step(scenario))
     flown: dict[str, dict[str, Miss]] = {}
-    schedules = plans(scenario, synthesis, onward)
+    schedules, remarks = plans(scenario, synthesis, onward)
     sets = list(scenario.dispersions.sets.items())
     for number, (name, half) in enumerate(sets):
         drawn = guidance.dispersed_cases(
@@ -133,4 +141,4 @@ def fly_dispersed(scenario: Scenario, synthesis: Synthesis, cases: int, progress
                 law_of(scenario, onward, plan, schedule), reference, drawn, stop_altitude=scenario.reference.stop_altitude_m,
                 t_max=float(onward.t[-1]), step=flight_step(scenario), progress=report,
             )  # fmt: skip
-    return flown
+    return flown, remarks

@@ -12,7 +12,7 @@ import time
 import types
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 from matplotlib.figure import Figure
@@ -28,6 +28,9 @@ Run = Callable[..., Outcome]
 
 class FakeStudy:
     """Stands for a finished gain study."""
+
+    remarks = ("a remark",)
+    closed_loop: ClassVar[dict[str, Any]] = {}
 
     def __init__(self, failed: Sequence[tuple[str, int, str]] = (), value: float = 547.064) -> None:
         self.failed = list(failed)

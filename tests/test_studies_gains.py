@@ -158,7 +158,7 @@ def test_without_dispersion_every_schedule_flies_the_reference() -> None:
     onward = guidance.continued(s.reference, 0.5)
     none = dict.fromkeys(("gamma", "V", "density", "drag", "lift", "wave_amplitude"), 0.0) | {"wave_length": 3e4}
     cases = guidance.dispersed_cases(s.reference.model, s.reference.x[0], none, cases=1, seed=(0, 0))
-    for name, plan in schedules.plans(scenario, s, onward).items():
+    for name, plan in schedules.plans(scenario, s, onward)[0].items():
         law = guidance.guidance_law(onward, plan, sample=1.0, limit=0.25, gate=0.05, name=name)
         miss = guidance.fly(law, s.reference, cases, stop_altitude=1e4, t_max=900.0, step=0.5)
         assert miss.worst < 1e-3, name  # km; RK4 against RK8
@@ -254,3 +254,51 @@ def test_tabulated_atmosphere_is_certified_too() -> None:
     study = gains.run(Scenario.default().edit({"atmosphere.model": "us76_smooth"}), at=[0.0])
     assert study.certificate()["riccati_residual"] < 1e-6
     assert study.certificate()["routes_difference"] < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"guidance.split_s": 20.0}, "breakpoints"),
+        ({"reference.stop_altitude_m": 99990.0}, "gate_load_g"),
+    ],
+)
+def test_a_fit_that_is_impossible_costs_only_itself(changes: dict, text: str) -> None:
+    study = gains.run(Scenario.default().edit(changes), dispersions=3)
+    assert set(study.closed_loop["small"]) == {"open_loop", "time_varying", "time_mean", "paper", "paper_unsplit"}
+    assert any("no constants are fitted" in remark and text in remark for remark in study.remarks)
+
+
+def test_fitted_constants_come_from_other_cases_above_the_gate(study: gains.GainsStudy) -> None:
+    assert schedules.TRAINING_STREAM >= len(list(study.scenario.dispersions.sets.items()))
+    s = study.synthesis
+    onward = guidance.continued(s.reference, 0.5)
+    low, high = (
+        schedules.fitted(study.scenario.edit({"guidance.gate_load_g": gate}), s, onward) for gate in (0.05, 0.9)
+    )  # fmt: skip
+    assert not np.allclose(low.K, high.K, rtol=1e-2)
+
+
+def test_an_infinite_condition_number_is_null_in_json() -> None:
+    study = gains.run(Scenario.default().edit({"weights.terminal": [0.1, 250, 0.01, 500]}), at=[0.0])
+    text = json.dumps(study.to_dict(), allow_nan=False)
+    assert json.loads(text)["certificate"]["riccati_residual"] < 1e-6
+
+
+def test_aims_that_are_missed_are_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(synthesis, "HALVINGS", 0)
+    monkeypatch.setattr(synthesis, "DEFECT", 1e-12)
+    study = gains.run(Scenario.default(), at=[0.0])
+    assert "aim 1e-12" in study.remarks[0]
+    assert study.to_dict()["remarks"] == list(study.remarks)
+
+
+@pytest.mark.parametrize("bad", [2.5, True, -1])
+def test_a_wrong_number_of_cases_is_refused(bad: object) -> None:
+    with pytest.raises(models.ModelError, match="dispersions"):
+        gains.run(Scenario.default(), dispersions=bad)
+
+
+def test_flying_past_the_vertical_is_said() -> None:
+    study = gains.run(Scenario.default().edit({"reference.bank_deg": 180, "reference.stop_altitude_m": 0}), at=[0.0])
+    assert any("vertical" in remark for remark in study.remarks)
