@@ -37,7 +37,7 @@ class Task:
     def __init__(self, cases: int) -> None:
         self.scenario = s = Scenario.default()
         self.reference = build_reference(s)
-        self.spline = synthesize(s, self.reference).spline()
+        self.schedule = guidance.interpolated(self.reference.t, synthesize(s, self.reference).K)
         self.step = min(s.numerics.step_s, s.guidance.sample_s)
         self.onward = guidance.continued(self.reference, self.step)
         self.law = guidance.guidance_law(
@@ -50,10 +50,6 @@ class Task:
         }  # fmt: skip
         self.x0, self.p = guidance.dispersed_cases(self.reference.model, self.reference.x[0], widths, cases=cases, seed=(1, 1))
         self.t_max = float(self.reference.t[-1]) + guidance.AFTERWARDS
-
-    def schedule(self, times: Array) -> Array:
-        """K (M, 4) at times (M,), held after the end of the reference."""
-        return np.asarray(self.spline(np.minimum(times, self.reference.t[-1])), dtype=np.float64)
 
     def workbench(self) -> Array:
         """Downrange at the stop of all cases, m."""
