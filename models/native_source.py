@@ -19,7 +19,7 @@ from models.native_vector import prologue
 PART = 400  # instructions in one C function: compilers take more than linear time over longer ones
 WIDEST = 2**20  # bytes in one array of vectors: they stand on the stack
 LONG = 3000  # instructions from which on CasADi's C, which is one long function, takes compilers much longer than ours in parts
-LARGEST = 300_000  # instructions worth compiling
+LARGEST = 60_000  # instructions worth writing out in lanes; above, CasADi's own C keeps its loops as loops
 PREFIX = "rw_"  # before every generated name, so that no user's name meets one of the C library
 
 

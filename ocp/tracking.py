@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -107,7 +108,7 @@ class Tracker:
         q, qf = (positive_semidefinite(name, matrix(name, v, (n, n)), n) for name, v in (("Q", Q), ("Qf", Qf)))
         inverse: Array = np.linalg.inv(r).astype(np.float64)
         packed = [start, held, params, _upper(q), _upper(inverse), _upper(qf)]
-        t_f, margin, resolution, swept, rates = (v.full() for v in self.function.call([ca.DM(v) for v in packed]))
+        t_f, margin, resolution, swept, rates = _called(self.function, packed)
         duration = float(t_f[0, 0])
         if not abs(float(margin[0, 0])) < 1e-9:
             limit = self.search * self.forward_steps
@@ -123,7 +124,7 @@ class Tracker:
                 f" {float(resolution[0, 0]):.2g} of the nominal values, allowed is {RESOLUTION:g}; take a smaller search step or more steps"
             )
         d = np.concatenate([held, params, packed[3], packed[4]])
-        return self._gains(duration, held, params, d, swept.T[::-1], rates.T[::-1], certify)
+        return self._gains(duration, held, params, d, swept[::-1], rates[::-1], certify)
 
     def _gains(self, duration: float, held: Array, params: Array, d: Array, nodes: Array, rates: Array, certify: bool) -> Gains:
         nx, nu = len(self.model.states), len(held)
@@ -337,8 +338,30 @@ def _packed(square: ca.SX) -> ca.SX:
     return ca.vertcat(*[square[i, j] for i in range(n) for j in range(i, n)])
 
 
+@lru_cache(maxsize=16)
+def _triangle(n: int) -> tuple[np.ndarray, np.ndarray]:
+    rows, columns = np.triu_indices(n)
+    return rows, columns
+
+
 def _upper(values: Array) -> Array:
-    return np.asarray(values)[np.triu_indices(len(values))]
+    return np.asarray(values)[_triangle(len(values))]
+
+
+def _called(function: ca.Function, arguments: list[Array]) -> list[Array]:
+    """Outputs of a function of columns, each (columns, rows), through buffers: conversions would cost a fifth of the call."""
+    handle: Any = function  # CasADi's own stubs miss the Python form of the buffer calls
+    buffer, run = handle.buffer()
+    given = [np.ascontiguousarray(a, dtype=np.float64) for a in arguments]
+    results = [np.empty(function.size_out(i)[::-1]) for i in range(function.n_out())]
+    for i, array in enumerate(given):
+        if array.size != function.numel_in(i):
+            raise ModelError(f"{function.name()}: {function.name_in(i)}: expected {function.numel_in(i)} numbers, got {array.size}")
+        buffer.set_arg(i, array.data)
+    for i, result in enumerate(results):
+        buffer.set_res(i, result.data)
+    run()
+    return results
 
 
 def _full(packed: Array, n: int) -> Array:

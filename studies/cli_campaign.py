@@ -201,7 +201,7 @@ def _bar() -> Iterator[Callable[[int, int], None] | None]:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"), TimeRemainingColumn())
-    with console._libraries_to_stderr(), Progress(*columns, console=Console(stderr=True), transient=True, redirect_stdout=False) as bars:
+    with console.libraries_to_stderr(), Progress(*columns, console=Console(stderr=True), transient=True, redirect_stdout=False) as bars:
         task = bars.add_task("", total=None, rate="")
 
         def report(done: int, total: int) -> None:

@@ -119,7 +119,7 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]
 @contextlib.contextmanager
 def work() -> Iterator[Progress | None]:
     """Long work: a progress bar on stderr if that is a terminal, and stdout kept free of what libraries print."""
-    with _libraries_to_stderr():
+    with libraries_to_stderr():
         if not sys.stderr.isatty():
             yield None
             return
@@ -140,7 +140,7 @@ def work() -> Iterator[Progress | None]:
 
 
 @contextlib.contextmanager
-def _libraries_to_stderr() -> Iterator[None]:
+def libraries_to_stderr() -> Iterator[None]:
     """Solvers print from C to file descriptor 1; whoever reads our JSON must not see it."""
     _flush()
     with contextlib.ExitStack() as stack:
