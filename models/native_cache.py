@@ -80,6 +80,8 @@ def load(source: str, flags: tuple[str, ...]) -> Library:
             with tempfile.TemporaryDirectory(prefix="reentry-native-") as folder:
                 library = _load_bytes(Path(folder), compiled(Path(folder), source, flags, cc))
         except OSError as error:
+            if "undefined symbol" in str(error):
+                raise NotCompiledError(f"the compiled code cannot be loaded: {error}") from None
             raise NotCompiledError(
                 f"there is no place to compile and load in ({error}); free some disk space, or set TMPDIR to a disk that may execute"
             ) from None

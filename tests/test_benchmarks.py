@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from benchmarks import _entry, ensemble, tvlqr
+from benchmarks import _entry, ensemble, entry, tvlqr
 
 HERE = Path(__file__).resolve().parent.parent
 RNG = np.random.default_rng(3)
@@ -85,3 +85,10 @@ def test_json_is_one_object_and_nothing_else(name):
         [sys.executable, "-m", f"benchmarks.{name}", "--quick", "--json"], cwd=HERE, capture_output=True, text=True, check=True
     )
     assert {"machine", "rows"} <= set(json.loads(done.stdout))
+
+
+def test_entries_end_at_the_same_place():
+    result = entry.measure(quick=True)
+    assert result["agreement_of_accurate_answers_m"] < 1e-3
+    wrong = {row["tool"]: row["error_m"] for row in result["rows"] if not row["error_m"] <= result["target_m"]}
+    assert wrong == {}

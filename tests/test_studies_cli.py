@@ -8,7 +8,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 import types
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -350,10 +349,8 @@ def test_signals_leave_nothing_half_written(tmp_path: Path, number: int) -> None
     )
     assert process.stderr is not None
     assert process.stderr.readline() == "ready\n"
-    started = time.monotonic()
     process.send_signal(number)
     out, err = process.communicate(timeout=20)
-    assert time.monotonic() - started < 2.0
     assert (process.returncode, out) == (130, "")
     assert "interrupted" in err
     assert "Traceback" not in err
