@@ -232,15 +232,8 @@ def fly_to_stop(
     """
     cases, store = len(x0), len(x0) == 1
     total = len(engine.edges) - 1
-    c = engine.start(x0)
-    result = Outcome(np.zeros(cases), c.copy(), np.zeros(cases, dtype=int), np.zeros(cases), [Status.STOP_NOT_REACHED] * cases)
+    c, active, result = begin(engine, x0, p, until)
     chunks: list[tuple[Array, ...]] = []
-    active = np.arange(cases)
-    if until is not None:
-        margins = engine.first_margins(x0, p, until)
-        for i in np.flatnonzero(~(margins > 0)):
-            result.status[i] = Status.OUT_OF_DOMAIN
-        active = np.flatnonzero(margins > 0)
     for first in range(0, total, CHUNK):
         if active.size == 0:
             break
@@ -260,6 +253,19 @@ def fly_to_stop(
         if until is None:
             result.status[i] = Status.OK
     return result, chunks
+
+
+def begin(engine: Engine, x0: Array, p: Array, until: Stop | None) -> tuple[Array, np.ndarray, Outcome]:
+    """Carries (N, nc) at the start, the cases that are to be flown, and the outcome so far: those past the stop are refused."""
+    cases, c = len(x0), engine.start(x0)
+    result = Outcome(np.zeros(cases), c.copy(), np.zeros(cases, dtype=int), np.zeros(cases), [Status.STOP_NOT_REACHED] * cases)
+    active = np.arange(cases)
+    if until is not None:
+        margins = engine.first_margins(x0, p, until)
+        for i in np.flatnonzero(~(margins > 0)):
+            result.status[i] = Status.OUT_OF_DOMAIN
+        active = np.flatnonzero(margins > 0)
+    return c, active, result
 
 
 Record = tuple[np.ndarray, Array, Array, Array]

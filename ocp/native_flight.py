@@ -13,7 +13,7 @@ from models import native
 from models.core import Array, Model, Status
 from models.native import Mode, Native
 from models.native_loop import CROSSED, RUNNING, NativeLoop, compile_loop
-from ocp.flight import Engine, Outcome, conclude
+from ocp.flight import Engine, Outcome, begin, conclude
 from ocp.stops import Stop
 
 
@@ -36,15 +36,8 @@ def fly_native(
 
     Without a compiler the loop falls back to the interpreter with the same results, and says so once.
     """
-    cases, total = len(x0), len(engine.edges) - 1
-    c = engine.start(x0)
-    result = Outcome(np.zeros(cases), c.copy(), np.zeros(cases, dtype=int), np.zeros(cases), [Status.STOP_NOT_REACHED] * cases)
-    active = np.arange(cases)
-    if until is not None:
-        margins = engine.first_margins(x0, p, until)
-        for i in np.flatnonzero(~(margins > 0)):
-            result.status[i] = Status.OUT_OF_DOMAIN
-        active = np.flatnonzero(margins > 0)
+    total = len(engine.edges) - 1
+    c, active, result = begin(engine, x0, p, until)
     if active.size:
         loop, end = _compiled(engine.group, engine.model, until, mode)
         ends = loop.run(c[active], engine.queue(engine.edges[:-1], engine.edges[1:]), p[active])
