@@ -9,6 +9,7 @@ import platform
 import sys
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import casadi
@@ -24,6 +25,27 @@ def options(text: str | None) -> argparse.ArgumentParser:
     parser.add_argument("--quick", action="store_true", help="few settings, no repetition: for a look or a test, not for figures")
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output and nothing else")
     return parser
+
+
+def run(
+    text: str | None, measure: Callable[..., dict[str, Any]], show: Callable[[dict[str, Any]], None], *,
+    figure: Callable[[dict[str, Any], Path], None] | None = None,
+) -> None:  # fmt: skip
+    """Command line of a benchmark: ``measure(quick=...)``, and then its tables or JSON; with `figure` the option ``--figure FILE``."""
+    parser = options(text)
+    if figure is not None:
+        parser.add_argument("--figure", type=Path, metavar="FILE", help="also draw the figure into FILE (.png, .svg, .pdf)")
+    chosen = parser.parse_args()
+    drawn = figure is not None and chosen.figure is not None
+    if drawn and chosen.quick:
+        parser.error("--figure: a quick run measures too little to draw; leave --quick out")
+    result = measure(quick=chosen.quick)
+    if figure is not None and drawn:
+        figure(result, chosen.figure)
+    if chosen.json:
+        write_json(result)
+    else:
+        show(result)
 
 
 def best(call: Callable[[], Any], *, repeat: int = 20, budget: float = 2.0) -> float:

@@ -176,12 +176,8 @@ def task_rms(task: Task, downrange: Array) -> float:
     return float(np.sqrt(np.mean((downrange - task.reference["s"][-1]) ** 2))) / 1e3
 
 
-def main() -> None:
-    options = _bench.options(__doc__).parse_args()
-    result = measure(quick=options.quick)
-    if options.json:
-        _bench.write_json(result)
-        return
+def show(result: dict[str, Any]) -> None:
+    """The table."""
     lines = []
     ours = result["rows"][0]["seconds"]
     for row in result["rows"]:
@@ -195,4 +191,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    _bench.run(__doc__, measure, show)

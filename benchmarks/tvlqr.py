@@ -318,14 +318,5 @@ def show(result: dict[str, Any]) -> None:
         _bench.table("Where the workbench's time goes", ("stage", "setting", "time"), spent)
 
 
-def main() -> None:
-    options = _bench.options(__doc__).parse_args()
-    result = measure(quick=options.quick)
-    if options.json:
-        _bench.write_json(result)
-    else:
-        show(result)
-
-
 if __name__ == "__main__":
-    main()
+    _bench.run(__doc__, measure, show)

@@ -232,28 +232,10 @@ def evaluate(function: ca.Function, *arguments: Array, finite: bool = True) -> t
         A missing or extra argument, a wrong shape, a non-finite input or result.
     """
     name = function.name()
-    if len(arguments) != function.n_in():
-        raise ModelError(f"{name}: expected {function.n_in()} arguments {function.name_in()}, got {len(arguments)}; give every one")
-    count: int | None = None
-    columns = []
-    for i, argument in enumerate(arguments):
-        label = f"{name}: {function.name_in(i)}"
-        value = as_finite(label, argument)
-        n = function.size1_in(i)
-        if function.size2_in(i) > 1:
-            raise ModelError(f"{label}: is a matrix {function.size_in(i)}; numbers are passed to columns only: declare a vector")
-        if value.ndim not in (1, 2) or value.shape[-1] != n:
-            raise ModelError(f"{label}: expected shape ({n},) or (N, {n}), got {value.shape}; time or case axis first")
-        if value.ndim == 2:
-            if count is not None and value.shape[0] != count:
-                raise ModelError(f"{label}: {value.shape[0]} rows beside {count} of an earlier argument; give equal numbers of rows")
-            count = value.shape[0]
-        columns.append(value.T if value.ndim == 2 else value)
+    values, count = as_arguments(function, arguments)
     n_calls = 1 if count is None else count
-    if n_calls == 0:
-        raise ModelError(f"{name}: the batch is empty; give at least one row")
     mapped = function if n_calls == 1 else function.map(n_calls)
-    full = [_columns(c, n_calls) for c in columns]
+    full = [_columns(value.T, n_calls) for value in values]
     results = mapped.call([ca.DM(c) for c in full])
     out = []
     for i, result in enumerate(results):
@@ -268,6 +250,51 @@ def evaluate(function: ca.Function, *arguments: Array, finite: bool = True) -> t
             dense = dense[:, :, 0]
         out.append(dense if count is not None else dense[0])
     return tuple(out)
+
+
+def as_arguments(function: ca.Function, arguments: Sequence[object]) -> tuple[list[Array], int | None]:
+    """Arguments of a CasADi function of column vectors, checked.
+
+    Parameters
+    ----------
+    function : casadi.Function
+        Inputs of shape (n_i, 1).
+    arguments : sequence of array_like, shape (n_i,) or (N, n_i)
+        One for each input; those with a leading axis share the same N.
+
+    Returns
+    -------
+    values : list of ndarray
+        Float64, finite, in the shapes given.
+    count : int or None
+        N; None if no argument has a leading axis.
+
+    Raises
+    ------
+    ModelError
+        A missing or extra argument, a matrix as input, a wrong shape, a number that is not finite, an empty batch.
+    """
+    name = function.name()
+    if len(arguments) != function.n_in():
+        raise ModelError(f"{name}: expected {function.n_in()} arguments {function.name_in()}, got {len(arguments)}; give every one")
+    count: int | None = None
+    values = []
+    for i, argument in enumerate(arguments):
+        label = f"{name}: {function.name_in(i)}"
+        value = as_finite(label, argument)
+        n = function.size1_in(i)
+        if function.size2_in(i) > 1:
+            raise ModelError(f"{label}: is a matrix {function.size_in(i)}; numbers are passed to columns only: declare a vector")
+        if value.ndim not in (1, 2) or value.shape[-1] != n:
+            raise ModelError(f"{label}: expected shape ({n},) or (N, {n}), got {value.shape}; time or case axis first")
+        if value.ndim == 2:
+            if count is not None and value.shape[0] != count:
+                raise ModelError(f"{label}: {value.shape[0]} rows beside {count} of an earlier argument; give equal numbers of rows")
+            count = value.shape[0]
+        values.append(value)
+    if count == 0:
+        raise ModelError(f"{name}: the batch is empty; give at least one row")
+    return values, count
 
 
 def _columns(value: Array, count: int) -> Array:

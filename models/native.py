@@ -5,8 +5,10 @@ from __future__ import annotations
 import ctypes
 import itertools
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -14,18 +16,19 @@ import casadi as ca
 import numpy as np
 
 from models import native_source
-from models.checked import Array, ModelError, as_finite, evaluate
+from models.checked import Array, ModelError, as_arguments, evaluate
 from models.native_cache import Library, load
 from models.native_compiler import NativeWarning, NotCompiledError, compiler, cpu_target, flags_for, warn_once
 from models.native_export import export
 
-__all__ = ["Mode", "Native", "NativeWarning", "compile", "export", "native_available"]
+__all__ = ["Mode", "Native", "NativeWarning", "compile", "export", "native_available", "shared_by"]
 
 Mode = Literal["accurate", "fast"]
 Backend = Literal["lanes", "c", "interpreter"]
 LANES = (1, 2, 4, 8, 16)
 BEST_LANES = {"x86-64-v4": 8, "x86-64-v3": 8}  # measured on flights; 2 elsewhere
 WORTH_A_THREAD = 64  # vectors of cases; below, starting a thread costs more than it saves
+_MOST_THREADS: ContextVar[int | None] = ContextVar("most_threads", default=None)  # inside shared_by
 
 _DRIVER = """
 #define EXPORT __attribute__((visibility("default")))
@@ -110,7 +113,8 @@ class Native:
         finite : ndarray of bool, shape (N,)
             Rows all of whose outputs are finite; N = 1 for arguments without a leading axis.
         """
-        values, count = _checked(self.function, arguments)
+        checked, count = as_arguments(self.function, arguments)
+        values = [np.ascontiguousarray(value) for value in checked]
         rows = 1 if count is None else count
         if self.library is None:
             plain = evaluate(self.function, *values, finite=False)
@@ -257,10 +261,32 @@ def switched_off() -> bool:
     return os.environ.get("REENTRY_NATIVE", "").strip().lower() in ("off", "0", "no", "false")
 
 
+@contextmanager
+def shared_by(tasks: int) -> Iterator[None]:
+    """Context in which compiled code takes its part of the processors only; numbers do not depend on it.
+
+    Parameters
+    ----------
+    tasks : int
+        Tasks that share this machine, this one among them; each gets ``processors // tasks`` threads, at least one.
+
+    Raises
+    ------
+    ModelError
+    """
+    if tasks < 1:
+        raise ModelError(f"native: tasks that share the processors: expected an integer >= 1, got {tasks}; count this one too")
+    before = _MOST_THREADS.set(max(1, _processors() // tasks))
+    try:
+        yield
+    finally:
+        _MOST_THREADS.reset(before)
+
+
 def in_threads(run: Callable[[int, int], None], rows: int, lanes: int, threads: int, *, vectors_each: int = WORTH_A_THREAD) -> None:
     """Call ``run(first, last)`` for fixed parts of the rows, each a whole number of vectors, at once where it pays."""
-    vectors = -(-rows // lanes)
-    parts = max(1, min(threads, vectors // vectors_each))
+    vectors, most = -(-rows // lanes), _MOST_THREADS.get()
+    parts = max(1, min(threads, vectors // vectors_each, threads if most is None else most))
     edges = [min(rows, lanes * (vectors * k // parts)) for k in range(parts)] + [rows]
     if parts == 1:
         run(0, rows)
@@ -290,26 +316,3 @@ def _processors() -> int:
         return max(1, len(os.sched_getaffinity(0)))
     except AttributeError:
         return os.cpu_count() or 1
-
-
-def _checked(function: ca.Function, arguments: Sequence[Array]) -> tuple[list[Array], int | None]:
-    """Arguments as contiguous arrays of finite numbers, and the number of rows (None without a leading axis)."""
-    name = function.name()
-    if len(arguments) != function.n_in():
-        raise ModelError(f"{name}: expected {function.n_in()} arguments {function.name_in()}, got {len(arguments)}; give every one")
-    count: int | None = None
-    values = []
-    for i, argument in enumerate(arguments):
-        label = f"{name}: {function.name_in(i)}"
-        value = np.ascontiguousarray(as_finite(label, argument))
-        n = function.size1_in(i)
-        if np.ndim(argument) not in (1, 2) or value.shape[-1] != n:
-            raise ModelError(f"{label}: expected shape ({n},) or (N, {n}), got {np.shape(argument)}; time or case axis first")
-        if value.ndim == 2:
-            if count is not None and value.shape[0] != count:
-                raise ModelError(f"{label}: {value.shape[0]} rows beside {count} of an earlier argument; give equal numbers of rows")
-            count = value.shape[0]
-        values.append(value)
-    if count == 0:
-        raise ModelError(f"{name}: the batch is empty; give at least one row")
-    return values, count

@@ -318,7 +318,7 @@ def _fill(
         if workers or scheduler:
             client = stack.enter_context(campaign_workers.client_of(workers, scheduler))
             text, code = scenario.to_yaml(), campaign_store.code_digest()
-            outcomes = campaign_workers.on_workers(client, todo, lambda chunk: (fly_remote, text, drawn(chunk), native, code))
+            outcomes = campaign_workers.on_workers(client, todo, lambda chunk, tasks: (fly_remote, text, drawn(chunk), native, code, tasks))
         else:
             outcomes = campaign_workers.here(todo, lambda chunk: fly_drawn(scenario, drawn(chunk), native))
         for outcome in outcomes:

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from models.core import Array, ModelError, Status
-from models.native import NativeWarning, native_available
+from models.native import NativeWarning, native_available, shared_by
 from ocp.laws import Law
 from ocp.methods import RK4
 from ocp.simulate import NATIVE_FROM, simulate, simulate_ensemble
@@ -123,8 +123,8 @@ def fly_drawn(scenario: Scenario, drawn: Array, native: Backend) -> dict[str, np
     return fly_chunk(scenario, scenario.campaign.schedule, states, params, native=native)
 
 
-def fly_remote(text: str, drawn: Array, native: Backend, code: str) -> dict[str, np.ndarray]:
-    """As :func:`fly_drawn` on a worker: from the scenario's text, and with the same code as the one who asks.
+def fly_remote(text: str, drawn: Array, native: Backend, code: str, tasks: int) -> dict[str, np.ndarray]:
+    """As :func:`fly_drawn` on a worker: from the scenario's text, with the code of the one who asks, beside `tasks` - 1 others.
 
     Raises
     ------
@@ -136,7 +136,8 @@ def fly_remote(text: str, drawn: Array, native: Backend, code: str) -> dict[str,
             f"campaign: a worker runs other code (SHA-256 {code_digest()[:12]}) than this process ({code[:12]});"
             " install the same version of this package on all workers"
         )
-    return fly_drawn(Scenario.parse(text), drawn, native)
+    with shared_by(tasks):
+        return fly_drawn(Scenario.parse(text), drawn, native)
 
 
 def trajectory(scenario: Scenario, drawn: Array) -> Trajectory | None:

@@ -226,9 +226,12 @@ def create(path: Path, variables: Sequence[Variable], *, cases: int, chunk: int,
     require_empty(target)
     if target.is_dir():
         target.rmdir()
+    # made in memory and written here: zarr writes in several threads, and those that go on after one has failed leave litter
+    made: dict[str, Any] = {}
     with files.folder(target) as place:
+        memory = zarr.storage.MemoryStore(made)
         content = {**attributes, "format": FORMAT, "cases": cases, "chunk": chunk, "complete": False}
-        group = zarr.open_group(place, mode="w-", zarr_format=3, attributes=content)
+        group = zarr.open_group(memory, mode="w-", zarr_format=3, attributes=content)
         group.create_group(MARKERS)
         for v in variables:
             group.create_array(
@@ -237,7 +240,10 @@ def create(path: Path, variables: Sequence[Variable], *, cases: int, chunk: int,
             )  # fmt: skip
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # this part of the format is not in the standard yet, and xarray asks for it
-            zarr.consolidate_metadata(place, zarr_format=3)
+            zarr.consolidate_metadata(memory, zarr_format=3)
+        for key, value in made.items():
+            (place / key).parent.mkdir(exist_ok=True)
+            (place / key).write_bytes(value.to_bytes())
     return open_store(Path(path))
 
 

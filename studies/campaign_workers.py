@@ -68,8 +68,8 @@ def client_of(workers: int, scheduler: str | None, *, patience: float = 15.0) ->
             yield client
 
 
-def on_workers(client: Any, todo: Sequence[int], submit: Callable[[int], tuple[Any, ...]]) -> Iterator[Outcome]:
-    """Chunks as they are finished; ``submit(chunk)`` gives (function, arguments...) of one.
+def on_workers(client: Any, todo: Sequence[int], submit: Callable[[int, int], tuple[Any, ...]]) -> Iterator[Outcome]:
+    """Chunks as they are finished; ``submit(chunk, tasks)`` gives (function, arguments...) of one, beside `tasks` on its machine.
 
     A chunk that was on a worker when it died is flown again at the end, with no other chunk beside it; only a death then is held
     against it, and `TRIES` of them make it a failed chunk.
@@ -81,12 +81,13 @@ def on_workers(client: Any, todo: Sequence[int], submit: Callable[[int], tuple[A
     """
     waiting, suspects = deque(todo), deque[int]()
     running: dict[Any, int] = {}
-    width = 2
+    slots = {"": 1}
     while waiting or running:
-        width = _width(client, width)
+        slots = _slots(client) or slots
+        width, tasks = 2 * sum(slots.values()), max(slots.values())  # two on the way for each: no worker waits, no memory fills up
         while waiting and len(running) < width:
             chunk = waiting.popleft()
-            running[_submitted(client, submit(chunk))] = chunk
+            running[_submitted(client, submit(chunk, tasks))] = chunk
         # all results are fetched and let go of before one is stored: dask would compute again what a dying worker still holds
         for outcome in [_outcome(future, running.pop(future)) for future in _finished(client, list(running))]:
             if isinstance(outcome, Outcome):
@@ -96,7 +97,7 @@ def on_workers(client: Any, todo: Sequence[int], submit: Callable[[int], tuple[A
     for chunk in suspects:
         deaths = 0
         while deaths < TRIES:
-            (future,) = _finished(client, [_submitted(client, submit(chunk))])
+            (future,) = _finished(client, [_submitted(client, submit(chunk, 1))])
             outcome = _outcome(future, chunk)
             if isinstance(outcome, Outcome):
                 yield outcome
@@ -114,12 +115,16 @@ class _Death:
     deaths: int
 
 
-def _width(client: Any, before: int) -> int:
-    """Chunks to have on the way: two for each thread that there is now, so that no worker waits and no memory fills up."""
+def _slots(client: Any) -> dict[str, int]:
+    """Chunks that the workers of each machine fly at once, as they are now; empty if that is not known."""
+    slots: dict[str, int] = {}
     try:
-        return 2 * max(1, sum(client.nthreads().values()))
+        for worker, threads in client.nthreads().items():
+            machine = worker.rpartition(":")[0]  # of tcp://host:port
+            slots[machine] = slots.get(machine, 0) + max(1, threads)
     except OSError:
-        return before
+        return {}
+    return slots
 
 
 def _submitted(client: Any, task: tuple[Any, ...]) -> Any:

@@ -2,10 +2,12 @@
 
 import ctypes
 import math
+import os
 import subprocess
 import sys
 import textwrap
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import casadi as ca
 import numpy as np
@@ -97,30 +99,33 @@ def deviation(found, wanted, rows):
 
 
 def compare(seeds):
-    tested = 0
-    for seed in seeds:
+    """Number of rows compared; the compiler runs beside the interpreter."""
+
+    def one(seed):
         f, arguments = random_function(seed), points(seed)
         wanted, rows = evaluate(f, *arguments, finite=False), well_conditioned(f, arguments)
-        tested += int(rows.sum())
         for lanes, mode, limit in ((1, "accurate", ACCURATE), (4, "accurate", ACCURATE), (8, "fast", FAST)):
             compiled = native.compile(f, lanes=lanes, mode=mode)
             assert compiled.backend == ("c" if lanes == 1 else "lanes")
             found, finite = compiled.run(*arguments)
             assert deviation(found, wanted, rows) <= limit, (seed, lanes, mode)
             assert finite[rows].all()
-    return tested
+        return int(rows.sum())
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return sum(pool.map(one, seeds))
 
 
 @needs_compiler
 def test_random_functions_agree():
-    assert compare(range(12)) > 200  # most rows are well conditioned
+    assert compare(range(50)) > 800  # most rows are well conditioned
 
 
 @needs_compiler
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_five_hundred_random_functions_agree():
-    assert compare(range(12, 512)) > 8000
+    assert compare(range(50, 550)) > 8000
 
 
 @needs_compiler
@@ -225,6 +230,30 @@ def test_bits_do_not_depend_on_batch_or_threads(mode):
             assert np.array_equal(joined, w[: len(joined)], equal_nan=True), size
 
 
+def test_tasks_that_share_the_processors_take_their_part(monkeypatch):
+    monkeypatch.setattr(native, "_processors", lambda: 6)
+
+    def parts(threads=6, rows=1000):
+        seen = []
+        native.in_threads(lambda first, last: seen.append((first, last)), rows, 4, threads, vectors_each=1)
+        seen.sort()
+        assert seen[0][0] == 0
+        assert seen[-1][1] == rows
+        assert [first for first, _ in seen[1:]] == [last for _, last in seen[:-1]]
+        return len(seen)
+
+    assert parts() == 6
+    for tasks, wanted in ((1, 6), (2, 3), (4, 1), (6, 1), (100, 1)):
+        with native.shared_by(tasks):
+            assert parts() == wanted
+            assert parts(threads=2) == min(2, wanted)
+    with pytest.raises(ValueError, match="left"), native.shared_by(3):
+        raise ValueError("left")
+    assert parts() == 6
+    with pytest.raises(ModelError, match="expected an integer >= 1, got 0"), native.shared_by(0):
+        pass
+
+
 @needs_compiler
 def test_bits_do_not_depend_on_lanes_in_accurate_mode():
     f, arguments = random_function(11), points(11, 50)  # has sin(atan(x)), which GCC 12 replaces unless it is told not to
@@ -321,24 +350,27 @@ def float_state():
 
 @needs_compiler
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="fegetround by its name in the running program")
-def test_state_of_the_processor_is_unchanged_in_every_thread():
-    before = float_state()
+@pytest.mark.parametrize("mode", ["accurate", "fast"])
+@pytest.mark.parametrize("lanes", [1, 4, 8])
+def test_state_of_the_processor_is_unchanged_in_every_thread(mode, lanes):
+    before, seen = float_state(), []
     assert before[0]
-    model = models.entry_3dof(models.SOYUZ, atmosphere=models.us76_smooth())
-    x = np.array([v.nominal for v in model.states]) * np.full((2000, 1), 0.7)
-    seen = []
+    functions = [model().rhs for model in ENTRY_MODELS.values()] if lanes == 8 else [ENTRY_MODELS["3dof smooth"]().rhs]
 
-    def work(mode, lanes):
-        native.compile(model.rhs, mode=mode, lanes=lanes, threads=2)(x, np.zeros(1), model.p0)
-        seen.append(float_state())
+    def work():
+        for function in functions:
+            shapes = [(2000, function.size1_in(i)) for i in range(function.n_in())]
+            native.compile(function, mode=mode, lanes=lanes, threads=2).run(*(np.full(shape, 0.7) for shape in shapes))
+            seen.append(float_state())
 
-    for mode in ("accurate", "fast"):
-        for lanes in (1, 4, 8):
-            thread = threading.Thread(target=work, args=(mode, lanes))
-            thread.start()
-            thread.join()
-            work(mode, lanes)
-    assert seen == [before] * 12
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    work()
+    later = threading.Thread(target=lambda: seen.append(float_state()))  # begins in the state that the process has now
+    later.start()
+    later.join()
+    assert seen == [before] * (2 * len(functions) + 1)
 
 
 @needs_compiler
@@ -406,7 +438,7 @@ def test_loop_bits_do_not_depend_on_cases_threads_or_lanes():
     c0, p = np.column_stack([random.uniform(20, 130, 101), np.zeros(101)]), random.uniform(0, 1, (101, 1))
     q = np.column_stack([np.full(90, 0.02), np.full(90, 9.81)])
     whole = native_loop.compile_loop(group, margin, threads=1).run(c0, q, p)
-    for options in ({"threads": 2}, {"lanes": 1}, {"lanes": 4, "threads": 3}):
+    for options in ({"threads": 2}, {"lanes": 1}, {"lanes": 4, "threads": 3}, {"lanes": 8, "threads": 2}):
         again = native_loop.compile_loop(group, margin, **options).run(c0, q, p)
         assert np.array_equal(again.after, whole.after)
         assert np.array_equal(again.index, whole.index)
@@ -478,13 +510,27 @@ def test_export_compiles_alone_and_passes_its_own_test(tmp_path):
     assert strict(rhs).returncode == 1  # the driver sees a wrong number
 
 
+def under_sanitizers(folder, seeds):
+    functions = {f"random {seed}": (random_function(seed), None) for seed in seeds}
+    for name, make in ENTRY_MODELS.items():
+        model = make()
+        x = np.array([v.nominal for v in model.states]) * np.random.default_rng(2).uniform(0.4, 0.9, (8, len(model.states)))
+        functions[name] = (model.rhs, [x, np.full((8, 1), 0.3), np.tile(model.p0, (8, 1))])
+    for name, (function, given) in functions.items():
+        native.export(function, folder / name, points=given)
+        done = strict(folder / name, "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+        assert done.returncode == 0, (name, done.stdout + done.stderr)
+
+
+@needs_compiler
+def test_export_under_sanitizers(tmp_path):
+    under_sanitizers(tmp_path, range(5))
+
+
 @needs_compiler
 @pytest.mark.slow
-def test_export_under_sanitizers(tmp_path):
-    for seed in range(10):
-        native.export(random_function(seed), tmp_path / str(seed))
-        done = strict(tmp_path / str(seed), "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
-        assert done.returncode == 0, done.stdout + done.stderr
+def test_fifty_exports_under_sanitizers(tmp_path):
+    under_sanitizers(tmp_path, range(5, 55))
 
 
 def test_export_refuses_what_is_not_plain_c(tmp_path):

@@ -14,8 +14,10 @@ import numpy as np
 import pytest
 import xarray
 
+from models import native
 from models.checked import ModelError
 from models.native import NativeWarning, native_available
+from ocp import native_flight
 from studies import campaign, campaign_flight, campaign_store, campaign_workers
 from studies.campaign import Campaign, CampaignError
 from studies.campaign_flight import CODES, LOST, VARIABLES, backend_for, prepared
@@ -108,6 +110,20 @@ def test_compiled_flights_give_the_same_bytes_for_any_chunk(original: Campaign, 
         with pytest.raises(ModelError, match="it is flown by compiled code, which is not to be had here"):
             campaign.run(None, tmp_path / "7", resume=True)
     assert digest(campaign.run(None, tmp_path / "7", resume=True)) == digest(found[1])
+
+
+@pytest.mark.skipif(not native_available(), reason="no compiler")
+def test_compiled_flights_give_the_same_bytes_for_any_lanes_and_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(campaign, "backend_for", lambda scenario: "accurate")
+    found = set()
+    for lanes in (4, 8):
+        for threads in (1, 2):
+            monkeypatch.setattr(native, "BEST_LANES", {native.cpu_target(): lanes})
+            monkeypatch.setattr(native, "_processors", lambda threads=threads: threads)
+            native_flight._compiled.cache_clear()
+            found.add(digest(campaign.run(small(chunk=7), tmp_path / f"{lanes}-{threads}")))
+    native_flight._compiled.cache_clear()
+    assert len(found) == 1
 
 
 def test_who_flies_depends_on_the_whole_campaign(monkeypatch: pytest.MonkeyPatch) -> None:

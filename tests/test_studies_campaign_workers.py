@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from models.checked import ModelError
+from models.native import native_available
 from studies import campaign
 from studies.campaign import Campaign
 from studies.campaign_flight import fly_remote
@@ -40,14 +41,14 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
 # Run on the workers, which import this file by its name.
 
 
-def poison(value: float, text: str, drawn: Any, native: Any, code: str) -> Any:
+def poison(value: float, text: str, drawn: Any, native: Any, code: str, tasks: int) -> Any:
     """The chunk whose first draw has this value kills its worker, always."""
     if drawn[0, 0] == value:
         os._exit(1)
-    return fly_remote(text, drawn, native, code)
+    return fly_remote(text, drawn, native, code, tasks)
 
 
-def unreliable(folder: str, text: str, drawn: Any, native: Any, code: str) -> Any:
+def unreliable(folder: str, text: str, drawn: Any, native: Any, code: str, tasks: int) -> Any:
     """A worker leaves with every second chunk, but no chunk sees more than two of them leave."""
     left = Path(folder) / hashlib.sha256(drawn.tobytes()).hexdigest()
     deaths = len(left.read_text()) if left.exists() else 0
@@ -55,16 +56,40 @@ def unreliable(folder: str, text: str, drawn: Any, native: Any, code: str) -> An
         left.write_text("x" * (deaths + 1))
         time.sleep(random.uniform(0, 0.2))
         os._exit(1)
-    return fly_remote(text, drawn, native, code)
+    return fly_remote(text, drawn, native, code, tasks)
 
 
-def other_code(text: str, drawn: Any, native: Any, code: str) -> Any:
-    return fly_remote(text, drawn, native, "0" * 64)
+def other_code(text: str, drawn: Any, native: Any, code: str, tasks: int) -> Any:
+    return fly_remote(text, drawn, native, "0" * 64, tasks)
 
 
-def test_two_workers_give_the_same_bytes(original: Campaign, tmp_path: Path) -> None:
+def compiled_by_this_worker(folder: str, text: str, drawn: Any, native: Any, code: str, tasks: int) -> Any:
+    """Note how many threads the compiled code was divided among, on a machine of eight processors."""
+    from models import native as compiled
+
+    if not hasattr(compiled, "counted"):
+        in_threads, pool = compiled.in_threads, compiled.ThreadPoolExecutor
+        parts: list[int] = []
+
+        def counted(run: Any, rows: int, lanes: int, threads: int, *, vectors_each: int = 1) -> None:
+            parts.append(1)
+            in_threads(run, rows, 1, 8, vectors_each=1)  # as many as are allowed
+
+        def counted_pool(threads: int) -> Any:
+            parts.append(threads)
+            return pool(threads)
+
+        setattr(compiled, "counted", parts)  # noqa: B010 (kept between the chunks of one worker)
+        compiled.in_threads, compiled.ThreadPoolExecutor, compiled._processors = counted, counted_pool, lambda: 8
+    flown = fly_remote(text, drawn, native, code, tasks)
+    (Path(folder) / f"{os.getpid()}").write_text(f"{tasks} {max(compiled.counted)}")
+    return flown
+
+
+@pytest.mark.parametrize("workers", [1, 4])
+def test_workers_give_the_same_bytes(workers: int, original: Campaign, tmp_path: Path) -> None:
     seen: list[int] = []
-    done = campaign.run(SCENARIO, tmp_path / "store", workers=2, progress=lambda done, total: seen.append(done))
+    done = campaign.run(SCENARIO, tmp_path / "store", workers=workers, progress=lambda done, total: seen.append(done))
     assert digest(done) == digest(original)
     assert done.complete
     assert (seen[0], seen[-1], seen == sorted(seen)) == (0, 22, True)
@@ -81,6 +106,18 @@ def test_a_chunk_that_kills_its_workers_is_recorded(original: Campaign, tmp_path
         assert done.data[name][15:].tobytes() == original.data[name][15:].tobytes()
     monkeypatch.undo()
     assert digest(campaign.run(None, tmp_path / "store", resume=True)) == digest(original)
+
+
+@pytest.mark.skipif(not native_available(), reason="no compiler")
+@pytest.mark.parametrize("workers", [1, 2])
+def test_workers_share_the_processors_and_give_the_same_bytes(workers: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(campaign, "backend_for", lambda scenario: "accurate")
+    original = campaign.run(SCENARIO.edit({"campaign.chunk": 1000}), tmp_path / "original")
+    (tmp_path / "seen").mkdir()
+    monkeypatch.setattr(campaign, "fly_remote", functools.partial(compiled_by_this_worker, str(tmp_path / "seen")))
+    done = campaign.run(SCENARIO.edit({"campaign.chunk": 11}), tmp_path / "store", workers=workers)
+    assert digest(done) == digest(original)
+    assert {path.read_text() for path in (tmp_path / "seen").iterdir()} == {f"{workers} {8 // workers}"}
 
 
 def leaving_workers(original: Campaign, place: Path, times: int, monkeypatch: pytest.MonkeyPatch) -> None:
