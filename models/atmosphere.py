@@ -105,8 +105,8 @@ def exponential(*, surface_density: float = 1.225, scale_height: float = 7110.0,
         if not (math.isfinite(value) and value > 0):
             raise ModelError(f"exponential: {name} must be finite and > 0, got {value}; use SI units")
     h = ca.SX.sym("h")
-    density = surface_density * ca.exp(-h / scale_height)
-    pressure = surface_density * G0 * scale_height * ca.exp(-h / scale_height)
+    falling = ca.exp(h * (-1 / scale_height))  # a product: it stands in the innermost loop of every flight
+    density, pressure = surface_density * falling, surface_density * G0 * scale_height * falling
     return _atmosphere(
         "exponential", h, (density, ca.SX(scale_height * _GMR), pressure, ca.SX(a)), (-math.inf, math.inf),
         f"exponential: {surface_density:.8g} kg/m3 at the surface, scale height {scale_height:.8g} m",
@@ -200,7 +200,7 @@ def dispersion(
     casadi.SX
         Scalar, dimensionless.
     """
-    return factor * (1 + wave_amplitude * ca.sin(2 * math.pi * h / wave_length + wave_phase))
+    return factor * (1 + wave_amplitude * ca.sin(2 * math.pi / wave_length * h + wave_phase))
 
 
 def _atmosphere(name: str, h: ca.SX, quantities: Sequence[ca.SX], domain: tuple[float, float], source: str) -> Atmosphere:

@@ -158,7 +158,7 @@ def entry_planar(vehicle: Vehicle, *, atmosphere: Atmosphere | None = None, plan
     return define(
         "entry_planar", rhs, states=(*_flight_vars(), ALTITUDE, Var("s", "m", 1e6, (-1e8, 1e8), "downrange")),
         inputs=(Var("lift_ratio", "1", 0.3, (-20.0, 20.0), "vertical lift ratio"),),
-        params=_vehicle_params(vehicle) | dispersion_params(), outputs=OUTPUTS, out=out,
+        params=vehicle_params(vehicle) | dispersion_params(), outputs=OUTPUTS, out=out,
         source=f"Tang & Zhao 2000, eqs 2-3; {vehicle.name}; {air.name} atmosphere",
     )  # fmt: skip
 
@@ -235,7 +235,7 @@ def entry_3dof(vehicle: Vehicle, *, atmosphere: Atmosphere | None = None, planet
     )
     return define(
         "entry_3dof", rhs, states=states, inputs=(Var("bank", "rad", 1.0, (-4 * math.pi, 4 * math.pi), "bank angle"),),
-        params=_vehicle_params(vehicle) | dispersion_params(), outputs=OUTPUTS, out=out,
+        params=vehicle_params(vehicle) | dispersion_params(), outputs=OUTPUTS, out=out,
         source=f"Vinh et al., ch. 2, in vectors; {vehicle.name}; {air.name} atmosphere",
     )  # fmt: skip
 
@@ -267,7 +267,8 @@ def local_gravity(r: ca.SX, lat: ca.SX, planet: Planet) -> ca.SX:
     return ca.vertcat(0, -sl * g[0] + cl * g[2], cl * g[0] + sl * g[2])
 
 
-def _vehicle_params(vehicle: Vehicle) -> dict[Var, float]:
+def vehicle_params(vehicle: Vehicle) -> dict[Var, float]:
+    """Mass and reference area, by default the vehicle's."""
     return {
         Var("mass", "kg", 1e3, (1e-6, 1e7), "mass"): vehicle.mass,
         Var("area", "m2", 1.0, (1e-9, 1e5), "reference area"): vehicle.area,

@@ -14,43 +14,131 @@ from models.checked import Array, ModelError, as_finite, evaluate
 from models.native_cache import Library
 from models.native_compiler import NotCompiledError
 
-RUNNING, CROSSED, NONFINITE = 0, 1, 2
+RUNNING, CROSSED, NONFINITE, REFUSED = 0, 1, 2, 3
 _CHUNK = 32  # groups between two looks at the margins, without a compiler
+_FOUND = 2.0
+_MOST = 1000  # evaluations of a search; a search that needs more has no end
 
 _DRIVER = """
 #define EXPORT __attribute__((visibility("default")))
-EXPORT void rw_loop(const double *c0, const double *q, const double *p, i64 groups, double *before, double *after, i64 *index,
-                    unsigned char *outcome, i64 first, i64 last) {{
-  for (i64 r = first; r < last; r += LANES) {{
-    L x[{nc} + {nq} + {np}], y[{nc}], z[{nc} + {np} + 1], g[1];
-    i64 row[LANES], count = last - r < LANES ? last - r : LANES;
-    M alive;
-    for (i64 l = 0; l < LANES; l++) {{ row[l] = r + (l < count ? l : count - 1); alive[l] = -(i64)(l < count); }}
-    for (i64 k = 0; k < {nc}; k++) x[k] = lane_rows(c0 + k, row, {nc});
+EXPORT void rw_loop(const double *c0, const double *q, const double *p, i64 groups, double *before, double *after, double *fraction,
+                    i64 *index, unsigned char *outcome, i64 *taken, i64 cases) {{
+  for (i64 r; (r = LANES * __atomic_fetch_add(taken, 1, __ATOMIC_RELAXED)) < cases;) {{
+    L x[{nc} + {nq} + {np}], y[{nc}], z[{nc} + {np} + 1], g[1], b[{nc}], e[{nc}];
+    i64 row[LANES], last = cases - r < LANES ? cases - r : LANES;
+    M alive, met = {{0}}, bad = {{0}}, at = {{0}};
+    for (i64 l = 0; l < LANES; l++) {{ row[l] = r + (l < last ? l : last - 1); alive[l] = -(i64)(l < last); }}
+    for (i64 k = 0; k < {nc}; k++) b[k] = e[k] = x[k] = lane_rows(c0 + k, row, {nc});
+    for (i64 k = 0; k < {nq}; k++) x[{nc} + k] = lane_all(groups ? q[k] : 0.0);
     for (i64 k = 0; k < {np}; k++) z[{nc} + k] = x[{nc} + {nq} + k] = lane_rows(p + k, row, {np});
+    M refused = {{0}};
+{refuse}
+    alive &= ~refused;
     for (i64 m = 0; m < groups && lane_any(alive); m++) {{
       for (i64 k = 0; k < {nq}; k++) x[{nc} + k] = lane_all(q[m * {nq} + k]);
       {group}(x, y);
-      M bad = {{0}};
-      for (i64 k = 0; k < {nc}; k++) {{ bad |= lane_bad(y[k]); z[k] = y[k]; }}
+      M wrong = {{0}};
+      for (i64 k = 0; k < {nc}; k++) {{ wrong |= lane_bad(y[k]); z[k] = y[k]; }}
       {margin}(z, g);
-      bad |= lane_nan(g[0]);
-      M ended = alive & (bad | (g[0] <= 0.0));
-      if (lane_any(ended))
-        for (i64 l = 0; l < count; l++) if (ended[l]) {{
-          for (i64 k = 0; k < {nc}; k++) {{ before[(r + l) * {nc} + k] = x[k][l]; after[(r + l) * {nc} + k] = y[k][l]; }}
-          index[r + l] = m; outcome[r + l] = bad[l] ? {nonfinite} : {crossed};
-        }}
-      alive &= ~ended;
+      wrong |= lane_nan(g[0]);
+      M ended = alive & (wrong | (g[0] <= 0.0));
+      if (__builtin_expect(lane_any(ended), 0)) {{
+        for (i64 k = 0; k < {nc}; k++) {{ b[k] = lane_choose(ended, x[k], b[k]); e[k] = lane_choose(ended, y[k], e[k]); }}
+        at = (at & ~ended) | (ended & m);
+        bad |= ended & wrong; met |= ended & ~wrong;
+        alive &= ~ended;
+      }}
       for (i64 k = 0; k < {nc}; k++) x[k] = lane_choose(alive, y[k], x[k]);
     }}
-    for (i64 l = 0; l < count; l++) if (alive[l]) {{
-      for (i64 k = 0; k < {nc}; k++) before[(r + l) * {nc} + k] = after[(r + l) * {nc} + k] = x[k][l];
-      index[r + l] = groups; outcome[r + l] = {running};
+    at = (at & ~alive) | (alive & groups);
+    for (i64 k = 0; k < {nc}; k++) {{ b[k] = lane_choose(alive, x[k], b[k]); e[k] = lane_choose(alive, x[k], e[k]); }}
+    L part = lane_number(met);
+{search}
+    for (i64 l = 0; l < last; l++) {{
+      for (i64 k = 0; k < {nc}; k++) {{ before[(r + l) * {nc} + k] = b[k][l]; after[(r + l) * {nc} + k] = e[k][l]; }}
+      index[r + l] = at[l]; fraction[r + l] = part[l];
+      outcome[r + l] = refused[l] ? {refused} : bad[l] ? {nonfinite} : met[l] ? {crossed} : {running};
     }}
   }}
 }}
 """
+_REFUSE = "    {start}(x, g);\n    refused = alive & ~(g[0] > 0.0);"
+_SEARCH = """    if (lane_any(met)) {{
+      L a[2 * {nc} + {nq} + {np} + 1], w[{nc} + {nq} + {np} + {ns}], v[{nc} + {ns}];
+      M there = met & at;
+      for (i64 k = 0; k < {nc}; k++) {{ a[k] = w[k] = b[k]; a[{nc} + k] = e[k]; }}
+      for (i64 k = 0; k < {nq}; k++) {{
+        L t;
+        for (i64 l = 0; l < LANES; l++) t[l] = q[there[l] * {nq} + k];
+        a[2 * {nc} + k] = w[{nc} + k] = t;
+      }}
+      for (i64 k = 0; k < {np}; k++) a[2 * {nc} + {nq} + k] = w[{nc} + {nq} + k] = z[{nc} + k];
+      a[2 * {nc} + {nq} + {np}] = lane_all(1.0);
+      L *s = w + {nc} + {nq} + {np};
+      {bracket}(a, s);
+      M open = met;
+      for (i64 n = 0; n < {most} && lane_any(open); n++) {{
+        part = lane_choose(open, s[0], part);
+        {probe}(w, v);
+        for (i64 k = 0; k < {nc}; k++) e[k] = lane_choose(open, v[k], e[k]);
+        for (i64 k = 0; k < {ns}; k++) s[k] = lane_choose(open, v[{nc} + k], s[k]);
+        open &= s[{state}] != {found};
+      }}
+    }}"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stopping:
+    """How a loop finds the place inside a group where the margin is zero.
+
+    Attributes
+    ----------
+    start : casadi.Function
+        (c, q, p) -> margin before a group; a case that begins with one <= 0 (or NaN) is refused.
+    bracket : casadi.Function
+        (c, c_after, q, p, reach) -> s: state of the search over the fractions [0, reach] of a group.
+    probe : casadi.Function
+        (c, q, p, s) -> (carry at the fraction s[0], s_next); the search ends where ``s_next[state]`` is 2.
+    state : int
+    """
+
+    start: ca.Function
+    bracket: ca.Function
+    probe: ca.Function
+    state: int
+
+    def locate(self, c: Array, after: Array, q: Array, p: Array, reach: Array) -> tuple[Array, Array]:
+        """Fractions (M,) of M groups at which the margin is zero, and the carries (M, nc) there, by CasADi's interpreter.
+
+        Parameters
+        ----------
+        c, after : ndarray, shape (M, nc)
+            Carries before a group and at its fraction `reach` (M,), where the margin is <= 0.
+        q : ndarray, shape (M, nq)
+        p : ndarray, shape (M, np)
+        """
+        s = evaluate(self.bracket, c, after, q, p, reach[:, None], finite=False)[0]
+        fraction, found = reach.copy(), after.copy()
+        active = np.arange(len(c))
+        for _ in range(_MOST):
+            if active.size == 0:
+                break
+            fraction[active] = s[active, 0]
+            found[active], s[active] = self._probed(c[active], q[active], p[active], s[active])
+            active = active[s[active, self.state] != _FOUND]
+        return fraction, found
+
+    def _probed(self, c: Array, q: Array, p: Array, s: Array) -> tuple[Array, Array]:
+        try:
+            at, following = evaluate(self.probe, c, q, p, s, finite=False)
+        except RuntimeError:  # an adaptive integrator gave up
+            if len(c) > 1:
+                parts = [self._probed(*(a[i : i + 1] for a in (c, q, p, s))) for i in range(len(c))]
+                return np.vstack([a for a, _ in parts]), np.vstack([b for _, b in parts])
+            s = s.copy()
+            s[:, self.state] = _FOUND
+            return np.full(c.shape, np.nan), s
+        return at, following
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,16 +149,21 @@ class Ends:
     ----------
     before, after : ndarray, shape (N, nc)
         Carry at the start and at the end of the group in which the case ended; both the last carry where it was not ended.
+        With a search, `after` is the carry at the stop.
     index : ndarray of int, shape (N,)
         That group, or the number of groups.
     outcome : ndarray of int, shape (N,)
-        0 RUNNING at the last group's end, 1 CROSSED (margin <= 0), 2 NONFINITE (a carry, or a NaN margin).
+        0 RUNNING at the last group's end, 1 CROSSED (margin <= 0), 2 NONFINITE (a carry, or a NaN margin), 3 REFUSED (with a search:
+        the margin was not positive at the start).
+    fraction : ndarray, shape (N,)
+        Part of the last group that was flown, 1 without a search; 0 unless CROSSED.
     """
 
     before: Array
     after: Array
     index: np.ndarray
     outcome: np.ndarray
+    fraction: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,6 +172,7 @@ class NativeLoop:
 
     group: ca.Function
     margin: ca.Function
+    stopping: Stopping | None
     backend: native.Backend
     reason: str
     lanes: int
@@ -105,7 +199,8 @@ class NativeLoop:
         sizes = [self.group.size1_in(i) for i in range(3)]
         values = []
         for name, value, size in zip(("c0", "q", "p"), (c0, q, p), sizes, strict=True):
-            array = np.ascontiguousarray(as_finite(f"{self.group.name()}: {name}", value))
+            ready = isinstance(value, np.ndarray) and value.dtype == np.float64 and np.isfinite(value).all()
+            array = np.ascontiguousarray(value if ready else as_finite(f"{self.group.name()}: {name}", value))
             if array.ndim != 2 or array.shape[1] != size:
                 raise ModelError(f"{self.group.name()}: {name}: expected shape (N, {size}), got {np.shape(value)}; one row for each")
             values.append(array)
@@ -113,20 +208,20 @@ class NativeLoop:
         if len(values[2]) != cases or cases == 0:
             raise ModelError(f"{self.group.name()}: {cases} rows of c0 beside {len(values[2])} of p; give equal numbers, at least one")
         if self.library is None:
-            return _interpreted(self.group, self.margin, values[0], values[1], values[2])
-        before, after = np.empty_like(values[0]), np.empty_like(values[0])
-        index, outcome = np.empty(cases, dtype=np.int64), np.empty(cases, dtype=np.uint8)
+            return _interpreted(self.group, self.margin, self.stopping, *values)
+        before, after, fraction = np.empty_like(values[0]), np.empty_like(values[0]), np.empty(cases)
+        index, outcome, taken = np.empty(cases, dtype=np.int64), np.empty(cases, dtype=np.uint8), np.zeros(1, dtype=np.int64)
         entry = self.library.entry("rw_loop")
         given: list[Any] = [native.address(a) for a in values]
-        given += [ctypes.c_longlong(len(values[1])), *(native.address(a) for a in (before, after, index, outcome))]
-        native.in_threads(lambda first, last: entry(*given, ctypes.c_longlong(first), ctypes.c_longlong(last)),
-                          cases, self.lanes, self.threads, vectors_each=1)  # fmt: skip
-        return Ends(before, after, index, outcome.astype(np.int64))
+        given += [ctypes.c_longlong(len(values[1])), *(native.address(a) for a in (before, after, fraction, index, outcome, taken))]
+        # each thread takes the next vector of cases until none is left: a busy processor then holds up nobody
+        native.in_threads(lambda first, last: entry(*given, ctypes.c_longlong(cases)), cases, self.lanes, self.threads, vectors_each=1)
+        return Ends(before, after, index, outcome.astype(np.int64), fraction)
 
 
 def compile_loop(
-    group: ca.Function, margin: ca.Function, *, lanes: int | Literal["auto"] = "auto", threads: int | Literal["auto"] = "auto",
-    mode: native.Mode = "accurate",
+    group: ca.Function, margin: ca.Function, *, stopping: Stopping | None = None, lanes: int | Literal["auto"] = "auto",
+    threads: int | Literal["auto"] = "auto", mode: native.Mode = "accurate",
 ) -> NativeLoop:  # fmt: skip
     """Compile the loop c -> group(c, q_m, p) over groups m, ended case by case where ``margin(c, p)`` is <= 0.
 
@@ -136,6 +231,8 @@ def compile_loop(
         (c (nc,), q (nq,), p (np,)) -> c_next (nc,), ...; further outputs are left out.
     margin : casadi.Function
         (c, p) -> scalar, positive before the stop.
+    stopping : Stopping, optional
+        Also find the place in the last group where the margin is zero.
     lanes, threads, mode : as in :func:`models.native.compile`
 
     Raises
@@ -151,16 +248,22 @@ def compile_loop(
         raise ModelError(f"native: {margin.name()}: expected (c ({nc},), p ({np_},)) -> scalar, got {margin}")
     group, margin = _first_output(group), _first_output(margin)
     if native.switched_off():
-        return NativeLoop(group, margin, "interpreter", "REENTRY_NATIVE is off", 1, 1, mode, None)
+        return NativeLoop(group, margin, stopping, "interpreter", "REENTRY_NATIVE is off", 1, 1, mode, None)
+    more = () if stopping is None else (stopping.start, stopping.bracket, stopping.probe)
     try:
-        written = native.write((group, margin), lanes, mode)
-        driver = _DRIVER.format(
-            group=written.names[0], margin=written.names[1], nc=nc, nq=nq, np=np_, running=RUNNING, crossed=CROSSED, nonfinite=NONFINITE
-        )  # fmt: skip
-        library = written.library(driver)
+        written = native.write((group, margin, *more), lanes, mode)
+        sizes: dict[str, Any] = {"group": written.names[0], "margin": written.names[1], "nc": nc, "nq": nq, "np": np_}
+        texts = {"refuse": "", "search": ""}
+        if stopping is not None:
+            names = dict(zip(("start", "bracket", "probe"), written.names[2:], strict=True))
+            texts["refuse"] = _REFUSE.format(**names)
+            more_sizes = {"ns": stopping.probe.size1_in(3), "state": stopping.state, "found": _FOUND, "most": _MOST}
+            texts["search"] = _SEARCH.format(**sizes, **names, **more_sizes)
+        codes = {"running": RUNNING, "crossed": CROSSED, "nonfinite": NONFINITE, "refused": REFUSED}
+        library = written.library(_DRIVER.format(**sizes, **texts, **codes))
     except (native_source.Unsupported, NotCompiledError, RuntimeError) as error:  # RuntimeError: CasADi has no C code for it
-        return NativeLoop(group, margin, "interpreter", native.interpreted(group, error), 1, 1, mode, None)
-    return NativeLoop(group, margin, written.backend, written.reason, written.lanes, workers, mode, library)
+        return NativeLoop(group, margin, stopping, "interpreter", native.interpreted(group, error), 1, 1, mode, None)
+    return NativeLoop(group, margin, stopping, written.backend, written.reason, written.lanes, workers, mode, library)
 
 
 def _first_output(function: ca.Function) -> ca.Function:
@@ -169,11 +272,15 @@ def _first_output(function: ca.Function) -> ca.Function:
     return ca.Function(function.name(), symbols, [ca.densify(function.call(symbols)[0])], function.name_in(), function.name_out()[:1])
 
 
-def _interpreted(group: ca.Function, margin: ca.Function, c0: Array, q: Array, p: Array) -> Ends:
+def _interpreted(group: ca.Function, margin: ca.Function, stopping: Stopping | None, c0: Array, q: Array, p: Array) -> Ends:
     """The same by CasADi's interpreter, some groups of all running cases at a time."""
     cases, nc = c0.shape
-    ends = Ends(c0.copy(), c0.copy(), np.full(cases, len(q)), np.full(cases, RUNNING))
+    ends = Ends(c0.copy(), c0.copy(), np.full(cases, len(q)), np.full(cases, RUNNING), np.zeros(cases))
     c, active = c0.copy(), np.arange(cases)
+    if stopping is not None and len(q):
+        refused = ~(evaluate(stopping.start, c, q[0], p, finite=False)[0][:, 0] > 0)
+        ends.outcome[refused], ends.index[refused] = REFUSED, 0
+        active = np.flatnonzero(~refused)
     for first in range(0, len(q), _CHUNK):
         if active.size == 0:
             break
@@ -188,11 +295,16 @@ def _interpreted(group: ca.Function, margin: ca.Function, c0: Array, q: Array, p
             margins[finite] = evaluate(margin, flown[finite], rows[finite], finite=False)[0][:, 0]
         event = ~(margins > 0)
         ended, where = event.any(axis=1), np.argmax(event, axis=1)
-        for k in np.flatnonzero(ended):
-            i, m = active[k], where[k]
-            ends.before[i], ends.after[i], ends.index[i] = c[i] if m == 0 else flown[k, m - 1], flown[k, m], first + m
-            ends.outcome[i] = NONFINITE if np.isnan(margins[k, m]) else CROSSED
+        i, m, k = active[ended], where[ended], np.flatnonzero(ended)
+        ends.before[i] = np.where((m == 0)[:, None], c[i], flown[k, np.maximum(m - 1, 0)])
+        ends.after[i], ends.index[i] = flown[k, m], first + m
+        ends.outcome[i] = np.where(np.isnan(margins[k, m]), NONFINITE, CROSSED)
         c[active] = flown[:, -1]
         active = active[~ended]
     ends.before[active] = ends.after[active] = c[active]
+    hit = np.flatnonzero(ends.outcome == CROSSED)
+    ends.fraction[hit] = 1.0
+    if stopping is not None and hit.size:
+        found = stopping.locate(ends.before[hit], ends.after[hit], q[ends.index[hit]], p[hit], np.ones(hit.size))
+        ends.fraction[hit], ends.after[hit] = found
     return ends

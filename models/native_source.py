@@ -16,7 +16,7 @@ import casadi as ca
 from models.native_spline import literal, spline_of
 from models.native_vector import prologue
 
-PART = 400  # instructions in one C function: compilers take more than linear time over longer ones
+PART = 2500  # instructions in one C function: compilers take more than linear time over longer ones, and each end costs stores and loads
 WIDEST = 2**20  # bytes in one array of vectors: they stand on the stack
 LONG = 3000  # instructions from which on CasADi's C, which is one long function, takes compilers much longer than ours in parts
 LARGEST = 60_000  # instructions worth writing out in lanes; above, CasADi's own C keeps its loops as loops

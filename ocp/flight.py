@@ -12,14 +12,16 @@ import casadi as ca
 import numpy as np
 
 from models.core import Array, Model, ModelError, Status, as_finite, as_scalar, evaluate
-from models.native import Native
+from models.native_loop import Stopping
 from ocp.laws import BoundLaw
 from ocp.methods import Method, group_of_steps
-from ocp.stops import Stop, crossing_fraction
+from ocp.stops import Stop, partial, stopping
 
 GROUP = 4  # steps in a group of a continuous law: a step over the group and two half steps find their midpoints among the nodes
 CHUNK = 64  # groups flown between two looks at the stop condition
-BLOCK = 4096  # cases flown together; bounds the memory
+BLOCK = 4096  # cases that the interpreter flies together, with the carries of a chunk: bounds the memory
+STATUSES = tuple(Status)
+CODE = {status: code for code, status in enumerate(STATUSES)}
 
 
 @lru_cache(maxsize=64)
@@ -36,7 +38,7 @@ def group_function(model: Model, step: ca.Function | None, n_z: int, n_w: int, m
     # with [rows, :], because an empty slice of a 1-by-1 by one index is a row, which vertcat then takes for an element
     x, z, held, w = c[:nx, :], c[nx : nx + n_z, :], c[nx + n_z :, :], q[2:, :]
     if step is None:
-        ends, z_next = w, z
+        ends, z_next = (ca.vertcat(w, w) if n_w == nu else w), z  # of equal ends the slope is gone, and what depends on u alone shared
     else:
         u, z_next = step(q[0], x, model.out(x, held, p), z, w)
         ends = ca.vertcat(u, u)
@@ -62,10 +64,7 @@ def _loop(group: ca.Function, count: int, store: bool) -> ca.Function:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Engine:
-    """A model under a law, ready to fly over given group edges (times, s, shape (M + 1,)).
-
-    `native` is the group's first output as compiled code, if ensembles are to use it.
-    """
+    """A model under a law, ready to fly over given group edges (times, s, shape (M + 1,)) to a stop condition, if there is one."""
 
     model: Model
     bound: BoundLaw
@@ -73,7 +72,8 @@ class Engine:
     prepare: ca.Function
     n: int
     edges: Array
-    native: Native | None = None
+    margin: ca.Function | None
+    stopping: Stopping | None
 
     def start(self, x0: Array) -> Array:
         """Carry c (N, nc) at the first edge; no input has been given yet, so it stands at zero."""
@@ -127,65 +127,60 @@ class Engine:
                 carry = C[i, j]
         return (C, X, U) if store else (C,)
 
-    def margins(self, c: Array, p: Array, until: Stop) -> Array:
-        """Least margin to the stop of each carry (M, nc), shape (M,); NaN where a state or an output is not finite."""
+    def steps(self) -> Array:
+        """The queue of all groups, shape (M, 2 + nw)."""
+        return self.queue(self.edges[:-1], self.edges[1:])
+
+    def margins(self, c: Array, p: Array) -> Array:
+        """Margin to the stop of each carry (M, nc), shape (M,); NaN where a state or an output is not finite."""
+        assert self.margin is not None
         out = np.full(len(c), np.nan)
         finite = np.isfinite(c).all(axis=1)
         if finite.any():
-            out[finite] = until.margins(self.model, *self.split(c[finite]), p[finite]).min(axis=1)
+            out[finite] = evaluate(self.margin, c[finite], p[finite], finite=False)[0][:, 0]
         return out
 
-    def first_margins(self, x0: Array, p: Array, until: Stop) -> Array:
+    def first_margins(self, x0: Array, p: Array) -> Array:
         """Margins at the start with the law's first input, shape (N,)."""
-        c = self.start(x0)
-        ends = evaluate(self.prepare, c, self.queue(self.edges[:1], self.edges[1:2])[0], p, finite=False)[2]
-        nu = len(self.model.inputs)
-        return self.margins(np.hstack([c[:, : c.shape[1] - nu], ends[:, :nu]]), p, until)
+        assert self.stopping is not None
+        first = self.queue(self.edges[:1], self.edges[1:2])[0]
+        return np.asarray(evaluate(self.stopping.start, self.start(x0), first, p, finite=False)[0][:, 0])
 
-    def _carry(self, c: Array, p: Array, index: np.ndarray, fraction: Array) -> Array:
+    def part(self, index: np.ndarray, fraction: Array) -> Array:
+        """Queue rows (M, 2 + nw) of the first `fraction` (M,) of groups `index` (M,).
+
+        A linear input ends where it has got to by then; a sampled law has read its tables at the start of the group.
+        """
+        groups, row = np.unique(index, return_inverse=True)
+        q = self.queue(self.edges[groups], self.edges[groups + 1])[row]
+        part = partial(q.T, fraction, len(self.model.inputs), held=self.bound.holds(len(self.model.inputs)))
+        return np.ascontiguousarray(part.T)
+
+    def carry(self, c: Array, p: Array, index: np.ndarray, fraction: Array) -> Array:
         """Carries (M, nc) after fractions (M,) of the groups `index` (M,)."""
-        start, length = self.edges[index], self.edges[index + 1] - self.edges[index]
-        if self.bound.sample is None:
-            q = self.queue(start, start + fraction * length)
-        else:  # a sampled law reads its tables at the start of the group, whatever part of it is flown
-            groups, row = np.unique(index, return_inverse=True)
-            q = self.queue(self.edges[groups], self.edges[groups + 1])[row]
-            q[:, 1] = fraction * length
-        if self.native is not None:
-            return self.native.run(c, q, p)[0][0]
         try:
-            return evaluate(self.group, c, q, p, finite=False)[0]
+            return evaluate(self.group, c, self.part(index, fraction), p, finite=False)[0]
         except RuntimeError:
             return np.full(c.shape, np.nan)
 
-    def reach(self, c: Array, p: Array, index: int, until: Stop) -> float:
+    def reach(self, c: Array, p: Array, index: int) -> float:
         """Fraction of a group that ends without a finite state at which the stop has just been met; 0 if it is not met before."""
         low, high = 0.0, 1.0
         for _ in range(4):  # 64^4: the stop may lie just before the edge of the model's domain
             fractions = np.linspace(low, high, 65)[1:]
             rows = [np.repeat(a[None], 64, axis=0) for a in (c, p)]
-            margins = self.margins(self._carry(rows[0], rows[1], np.full(64, index), fractions), rows[1], until)
+            margins = self.margins(self.carry(rows[0], rows[1], np.full(64, index), fractions), rows[1])
             first = int(np.argmax(~(margins > 0)))
             if margins[first] <= 0:
                 return float(fractions[first])
             low, high = fractions[first] - (high - low) / 64, float(fractions[first])
         return 0.0
 
-    def to_stop(self, c: Array, p: Array, index: np.ndarray, reach: Array, until: Stop) -> tuple[Array, Array]:
-        """Fractions (M,) of the groups `index` (M,), at most `reach`, at which the stop is met, and the carries (M, nc) there."""
 
-        def margin(part: Array) -> Array:
-            return self.margins(self._carry(c, p, index, part * reach), p, until)
-
-        low = self.margins(c, p, until)  # of the input before the group; after a jump only its sign is of use
-        part = crossing_fraction(margin, np.where(low > 0, low, 1.0), margin(np.ones(len(c))))
-        return part * reach, self._carry(c, p, index, part * reach)
-
-
-def prepare(model: Model, bound: BoundLaw, method: Method, t_max: float) -> Engine:
-    """Choose the groups of a flight over [0, t_max] and build its function."""
+def prepare(model: Model, bound: BoundLaw, method: Method, t_max: float, until: Stop | None, *, alone: bool = False) -> Engine:
+    """Choose the groups of a flight over [0, t_max] and build its functions; `alone`: each step of a continuous law is a group."""
     if bound.sample is None:
-        n = GROUP
+        n = 1 if alone else GROUP
         kinks = [0.0, *(t for t in bound.kinks if 0 < t < t_max), t_max]
         pieces = []
         length = GROUP * method.step
@@ -197,13 +192,16 @@ def prepare(model: Model, bound: BoundLaw, method: Method, t_max: float) -> Engi
             else:
                 pieces.append(np.linspace(start, end, count, endpoint=False))
         edges = np.concatenate([*pieces, [t_max]])
+        if alone:  # the same steps as those inside the groups
+            edges = np.append((edges[:-1, None] + np.diff(edges)[:, None] * (np.arange(GROUP) / GROUP)).ravel(), t_max)
     else:
         _check_count(t_max / bound.sample, t_max)
         n = max(1, int(np.ceil(bound.sample / method.step * (1 - 1e-12))))
         count = int(np.ceil(t_max / bound.sample * (1 - 1e-12)))
         edges = np.append(bound.sample * np.arange(count), t_max)
     group, first = group_function(model, bound.step, len(bound.z0), bound.n_signals, method, n)
-    return Engine(model, bound, group, first, n, edges)
+    margin, search = (None, None) if until is None else stopping(group, first, model, until, held=bound.holds(len(model.inputs)))
+    return Engine(model, bound, group, first, n, edges, margin, search)
 
 
 def _check_count(groups: float, t_max: float) -> None:
@@ -213,17 +211,17 @@ def _check_count(groups: float, t_max: float) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
-    """Where each of N cases ended: time, carry, last complete group, fraction of the next one, status."""
+    """Where each of N cases ended: time, carry, last complete group, fraction of the next one, status as a place in STATUSES."""
 
     t: Array
     c: Array
     group: np.ndarray
     fraction: Array
-    status: list[Status]
+    status: np.ndarray
 
 
 def fly_to_stop(
-    engine: Engine, x0: Array, p: Array, until: Stop | None, *,
+    engine: Engine, x0: Array, p: Array, *,
     progress: Callable[[float], None] | None = None, record: list[Record] | None = None,
 ) -> tuple[Outcome, list[tuple[Array, ...]]]:  # fmt: skip
     """Fly N cases until each has stopped, failed or reached the last edge; for N = 1 also all nodes, chunk by chunk.
@@ -232,7 +230,7 @@ def fly_to_stop(
     """
     cases, store = len(x0), len(x0) == 1
     total = len(engine.edges) - 1
-    c, active, result = begin(engine, x0, p, until)
+    c, active, result = begin(engine, x0, p)
     chunks: list[tuple[Array, ...]] = []
     for first in range(0, total, CHUNK):
         if active.size == 0:
@@ -241,29 +239,27 @@ def fly_to_stop(
         flown = engine.fly(c[active], p[active], first, count, store=store)
         if store:
             chunks.append(flown)
-        alive = _settle(engine, c, p, active, flown[0], first, until, result)
+        alive = _settle(engine, c, p, active, flown[0], first, result)
         if record is not None:
             record.append(_recorded(engine, c[active], active, flown[0], first, np.where(alive, count, result.group[active] - first + 1)))
         c[active[alive]] = flown[0][alive, -1]
         active = active[alive]
         if progress is not None:
             progress(1 - active.size / cases * (1 - (first + count) / total))
-    for i in active:
-        result.t[i], result.c[i], result.group[i] = engine.edges[-1], c[i], total
-        if until is None:
-            result.status[i] = Status.OK
+    result.t[active], result.c[active], result.group[active] = engine.edges[-1], c[active], total
+    if engine.stopping is None:
+        result.status[active] = CODE[Status.OK]
     return result, chunks
 
 
-def begin(engine: Engine, x0: Array, p: Array, until: Stop | None) -> tuple[Array, np.ndarray, Outcome]:
+def begin(engine: Engine, x0: Array, p: Array) -> tuple[Array, np.ndarray, Outcome]:
     """Carries (N, nc) at the start, the cases that are to be flown, and the outcome so far: those past the stop are refused."""
     cases, c = len(x0), engine.start(x0)
-    result = Outcome(np.zeros(cases), c.copy(), np.zeros(cases, dtype=int), np.zeros(cases), [Status.STOP_NOT_REACHED] * cases)
+    result = Outcome(np.zeros(cases), c.copy(), np.zeros(cases, dtype=int), np.zeros(cases), np.full(cases, CODE[Status.STOP_NOT_REACHED]))
     active = np.arange(cases)
-    if until is not None:
-        margins = engine.first_margins(x0, p, until)
-        for i in np.flatnonzero(~(margins > 0)):
-            result.status[i] = Status.OUT_OF_DOMAIN
+    if engine.stopping is not None:
+        margins = engine.first_margins(x0, p)
+        result.status[~(margins > 0)] = CODE[Status.OUT_OF_DOMAIN]
         active = np.flatnonzero(margins > 0)
     return c, active, result
 
@@ -281,48 +277,51 @@ def _recorded(engine: Engine, before: Array, active: np.ndarray, flown: Array, f
     return case[flown_now], times[flown_now], engine.split(starts)[0][flown_now], engine.split(flown)[1][flown_now]
 
 
-def _settle(
-    engine: Engine, c: Array, p: Array, active: np.ndarray, flown: Array, first: int, until: Stop | None, result: Outcome
-) -> np.ndarray:
+def _settle(engine: Engine, c: Array, p: Array, active: np.ndarray, flown: Array, first: int, result: Outcome) -> np.ndarray:
     """Record the cases of a chunk that stopped or failed; return the mask of those that fly on."""
     cases, count, nc = flown.shape
     finite = np.asarray(np.isfinite(flown).all(axis=2))
     crossed = np.zeros((cases, count), dtype=bool)
-    if until is not None:
-        margins = engine.margins(flown.reshape(-1, nc), np.repeat(p[active], count, axis=0), until).reshape(cases, count)
+    if engine.stopping is not None:
+        margins = engine.margins(flown.reshape(-1, nc), np.repeat(p[active], count, axis=0)).reshape(cases, count)
         crossed, finite = margins <= 0, finite & ~np.isnan(margins)
     event = crossed | ~finite
     ended = np.asarray(event.any(axis=1))
     where = np.argmax(event, axis=1)
     rows = np.arange(cases)
     before = np.where((where == 0)[:, None], c[active], flown[rows, np.maximum(where - 1, 0)])
-    conclude(engine, before[ended], p, active[ended], first + where[ended], crossed[rows, where][ended], until, result)
+    after, met = flown[rows, where], crossed[rows, where]
+    conclude(engine, before[ended], after[ended], p, active[ended], first + where[ended], met[ended], result)
     return ~ended
 
 
 def conclude(
-    engine: Engine, before: Array, p: Array, cases: np.ndarray, index: np.ndarray, crossed: np.ndarray, until: Stop | None, result: Outcome
+    engine: Engine, before: Array, after: Array, p: Array, cases: np.ndarray, index: np.ndarray, crossed: np.ndarray, result: Outcome
 ) -> None:
     """Record `cases` that ended in the groups `index`: at their stop where they crossed it, else as NONFINITE with the last good carry.
 
     A case without a finite end of its group may still have met the stop before: it is looked for.
     """
+    result.t[cases], result.c[cases], result.group[cases], result.fraction[cases] = engine.edges[index], before, index, 0.0
+    result.status[cases] = CODE[Status.NONFINITE]
+    if engine.stopping is None:
+        return
     reach = crossed.astype(float)
     for k in np.flatnonzero(~crossed):
-        i = cases[k]
-        result.t[i], result.c[i] = engine.edges[index[k]], before[k]
-        result.group[i], result.status[i] = index[k], Status.NONFINITE
-        if until is not None:
-            reach[k] = engine.reach(before[k], p[i], int(index[k]), until)
+        reach[k] = engine.reach(before[k], p[cases[k]], int(index[k]))
+    short = (reach > 0) & ~crossed
+    if short.any():
+        after = after.copy()
+        after[short] = engine.carry(before[short], p[cases[short]], index[short], reach[short])
     hit = np.flatnonzero(reach > 0)
-    if hit.size == 0 or until is None:
+    if hit.size == 0:
         return
-    fraction, carry = engine.to_stop(before[hit], p[cases[hit]], index[hit], reach[hit], until)
-    for k in np.flatnonzero(np.isfinite(carry).all(axis=1)):
-        i, edge = cases[hit[k]], engine.edges[index[hit[k]]]
-        result.t[i] = edge + fraction[k] * (engine.edges[index[hit[k]] + 1] - edge)
-        result.c[i], result.group[i], result.fraction[i] = carry[k], index[hit[k]], fraction[k]
-        result.status[i] = Status.OK
+    queue = engine.part(index[hit], np.ones(hit.size))
+    fraction, carry = engine.stopping.locate(before[hit], after[hit], queue, p[cases[hit]], reach[hit])
+    good = np.isfinite(carry).all(axis=1)
+    done, group, part = cases[hit[good]], index[hit[good]], fraction[good]
+    result.t[done] = engine.edges[group] + part * (engine.edges[group + 1] - engine.edges[group])
+    result.c[done], result.fraction[done], result.status[done] = carry[good], part, CODE[Status.OK]
 
 
 def nodes(engine: Engine, x0: Array, p: Array, outcome: Outcome, chunks: list[tuple[Array, ...]]) -> tuple[Array, Array, Array]:
@@ -336,7 +335,7 @@ def nodes(engine: Engine, x0: Array, p: Array, outcome: Outcome, chunks: list[tu
     if outcome.fraction[0] > 0:
         start = engine.start(x0) if groups == 0 else carries[-1:]
         end = edges[-1:] + outcome.fraction[0] * (engine.edges[groups + 1] - edges[-1])
-        _, last_x, last_u = evaluate(engine.group, start, engine.queue(edges[-1:], end), p)
+        _, last_x, last_u = evaluate(engine.group, start, engine.part(np.array([groups]), outcome.fraction), p)
         inner_x = np.concatenate([inner_x, last_x.reshape(1, nx, n)[0].T])
         inner_u = np.concatenate([inner_u, last_u.reshape(1, nu, n)[0].T])
         edges = np.append(edges, end)

@@ -23,7 +23,8 @@ class BoundLaw:
     Attributes
     ----------
     sample : float or None
-        Period of a sampled law, s; None for an input that runs linearly from w[:nu] to w[nu:] over each group of steps.
+        Period of a sampled law, s; None for an input that runs linearly from w[:nu] to w[nu:] over each group of steps, or, where
+        n_signals is nu, is held at w over each.
     step : casadi.Function or None
         (t, x, y, z, w) -> (u, z) at each sample.
     z0 : ndarray, shape (nz,)
@@ -41,6 +42,10 @@ class BoundLaw:
     n_signals: int
     kinks: tuple[float, ...] = ()
 
+    def holds(self, n_inputs: int) -> bool:
+        """True if the input stands still over each group."""
+        return self.sample is not None or self.n_signals == n_inputs
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Law:
@@ -55,8 +60,7 @@ def constant(**inputs: float) -> Law:
 
     def bind(model: Model) -> BoundLaw:
         u = _named_inputs(model, inputs)
-        both = np.concatenate([u, u])
-        return BoundLaw(None, None, np.zeros(0), lambda start, end: np.tile(both, (len(start), 1)), 2 * len(u))
+        return BoundLaw(None, None, np.zeros(0), lambda start, end: np.tile(u, (len(start), 1)), len(u))
 
     return Law("constant", bind)
 
@@ -88,12 +92,11 @@ def profile(t: ArrayLike, *, kind: str = "linear", **columns: ArrayLike) -> Law:
 
         def signals(start: Array, end: Array) -> Array:
             if kind == "previous":
-                held = points[np.clip(np.searchsorted(times, 0.5 * (start + end), side="right") - 1, 0, None)]
-                return np.hstack([held, held])
+                return points[np.clip(np.searchsorted(times, 0.5 * (start + end), side="right") - 1, 0, None)]
             ends = [np.column_stack([np.interp(moment, times, column) for column in points.T]) for moment in (start, end)]
             return np.hstack(ends)
 
-        return BoundLaw(None, None, np.zeros(0), signals, 2 * points.shape[1], tuple(times.tolist()))
+        return BoundLaw(None, None, np.zeros(0), signals, points.shape[1] * (1 if kind == "previous" else 2), tuple(times.tolist()))
 
     return Law(f"{kind} profile", bind)
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from models.core import Array, Model, ModelError, as_scalar, evaluate, unknown_name
+from models.core import Model, ModelError, as_scalar, unknown_name
+from models.native_loop import Stopping
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,19 +30,10 @@ class Stop:
             group, index = _place(model, name)
             column = x[index] if group == "state" else model.out(x, u, p)[index]
             margin = sign * (value - column) / max(abs(value), _scale(model, name))
-            least = margin if len(self.conditions) == 1 else ca.fmin(least, margin)
+            total = least + margin
+            # a margin that is NaN makes the least one NaN, whichever it is: fmin alone would pass it over
+            least = margin if len(self.conditions) == 1 else ca.if_else(total <= ca.inf, ca.fmin(least, margin), total)
         return least
-
-    def margins(self, model: Model, x: Array, u: Array, p: Array) -> Array:
-        """(M, number of conditions): positive before a crossing, <= 0 after it, in units of the condition's scale.
-
-        NaN where an output is not finite.
-        """
-        columns = []
-        for name, value, sign in self.conditions:
-            column, scale = _column(model, name, x, u, p)
-            columns.append(sign * (value - column) / max(abs(value), scale))
-        return np.column_stack(columns)
 
 
 def falls_below(name: str, value: float) -> Stop:
@@ -72,59 +65,136 @@ def _scale(model: Model, name: str) -> float:
     return 1e-3 * (model.states if group == "state" else model.outputs)[i].nominal
 
 
-def _column(model: Model, name: str, x: Array, u: Array, p: Array) -> tuple[Array, float]:
-    group, i = _place(model, name)
-    column = x[:, i] if group == "state" else evaluate(model.out, x, u, p, finite=False)[0][:, i]
-    return column, _scale(model, name)
+TRIAL, STATE = 0, 7  # places in s = [trial, low, its margin, its slope, high, its margin, its slope, state, step, nudge, count]
+SEARCHING, LAST, FOUND = 0, 1, 2  # values of s[STATE]
+CLOSE = 1e-12  # of a group: how near the crossing the search ends
+PATIENCE = 40  # evaluations after which it only halves
 
 
-def crossing_fraction(margin: Callable[[Array], Array], low: Array, high: Array) -> Array:
-    """Zero of a decreasing scalar function in [0, 1], for many cases at once.
-
-    Parameters
-    ----------
-    margin : callable
-        fraction (M,) -> margin (M,).
-    low, high : ndarray, shape (M,)
-        Margins at fractions 0 (> 0) and 1 (<= 0).
+def narrowing() -> tuple[ca.Function, ca.Function]:
+    """The search for the zero of a decreasing scalar function, as two functions of numbers.
 
     Returns
     -------
-    ndarray, shape (M,)
-        Fractions, to 1e-14 of the interval.
+    first : (f_low, slope_low, high, f_high, slope_high) -> s (11,)
+        The bracket [0, high].  Only the sign of a value whose slope is not negative is used.
+    next : (s, f, slope) -> s
+        Take in the value and the slope at the trial s[0], and choose the next.
 
     Notes
     -----
-    Source: Chandrupatla, A new hybrid quadratic/bisection algorithm for finding the zero of a nonlinear function without
-    using derivatives, Advances in Engineering Software 28(3), 1997: inverse quadratic interpolation where it is safe, else
-    bisection; about ten evaluations for a smooth margin.  A margin that is NaN counts as beyond the crossing.
+    The trial is the zero of the inverse cubic through values and slopes at both ends where that cubic increases (Fritsch and Carlson's
+    condition), else Newton's step where it stays inside, else the middle; also the middle where the steps do not halve.  So a smooth margin
+    takes two or three evaluations and any margin less than a hundred.  A trial nearer to the newest point than a nudge lies beyond the zero
+    by that nudge, so that the bracket closes from both sides; nudges grow, since rounding may hide the sign.  NaN is beyond the crossing.
     """
-    a, fa = np.ones_like(low), np.where(np.isnan(high), -1.0, high)  # newest point
-    b, fb = np.zeros_like(low), low.copy()  # other end of the bracket
-    t, x = np.full_like(low, 0.5), a.copy()
-    done = fa == 0
-    for _ in range(200):
-        if done.all():
-            break
-        trial = np.where(done, x, a + t * (b - a))
-        f = margin(trial)
-        f = np.where(np.isnan(f), -1.0, f)
-        same = (f > 0) == (fa > 0)
-        c, fc = np.where(same, a, b), np.where(same, fa, fb)
-        b, fb = np.where(same, b, a), np.where(same, fb, fa)
-        a, fa = trial, f
-        x = np.where(done, x, np.where(np.abs(fa) < np.abs(fb), a, b))
-        width = np.maximum(np.abs(b - a), 1e-300)
-        done = done | (width < 1e-14) | (fa == 0)
-        t = np.clip(_step(a, b, c, fa, fb, fc), *(np.minimum(0.5e-14 / width, 0.5), 1 - np.minimum(0.5e-14 / width, 0.5)))
-    return x
+    s, f, slope = ca.SX.sym("s", 11), ca.SX.sym("f"), ca.SX.sym("slope")
+    x, step, nudge, count = s[TRIAL], s[8], s[9], s[10]
+    value, rate = _usable(f, slope)
+    before = value > 0
+    low = [ca.if_else(before, a, b) for a, b in zip((x, value, rate), ca.vertsplit(s[1:4]), strict=True)]
+    high = [ca.if_else(before, b, a) for a, b in zip((x, value, rate), ca.vertsplit(s[4:7]), strict=True)]
+    width = high[0] - low[0]
+    steepness = ca.fmin(-rate, 4 * (low[1] - high[1]) / width)  # a slope that the bracket does not bear out proves nothing
+    hit = ca.fabs(value) <= CLOSE * steepness  # also an exact zero
+    closed = ca.logic_or(width <= 2 * CLOSE, count > 200)
+    cubic, good = _inverse_cubic(low, high)
+    newton = x - value / ca.if_else(rate < 0, rate, -1)
+    inside = ca.logic_and(ca.logic_and(rate < 0, newton > low[0]), newton < high[0])
+    middle = 0.5 * (low[0] + high[0])
+    trial = ca.if_else(good, cubic, ca.if_else(inside, newton, middle))
+    move = ca.fabs(trial - x)
+    near = move < nudge
+    trial = ca.if_else(near, x + ca.if_else(before, nudge, -nudge), trial)
+    inside = ca.logic_and(trial > low[0], trial < high[0])
+    fast = ca.logic_and(ca.logic_or(near, move <= 0.5 * step), count < PATIENCE)
+    halve = ca.logic_not(ca.logic_and(inside, fast))
+    trial = ca.if_else(halve, middle, trial)
+    move = ca.if_else(ca.logic_or(halve, near), width, move)
+    nearer = ca.if_else(ca.fabs(low[1]) < ca.fabs(high[1]), low[0], high[0])
+    end = ca.if_else(hit, x, nearer)
+    state = ca.if_else(ca.logic_or(hit, closed), ca.if_else(end == x, FOUND, LAST), SEARCHING)
+    trial = ca.if_else(state > SEARCHING, end, trial)
+    going = ca.vertcat(trial, *low, *high, state, move, ca.if_else(near, 4 * nudge, nudge), count + 1)
+    ended = ca.vertcat(s[:STATE], FOUND, s[STATE + 1 :])
+    result = ca.cse(ca.if_else(s[STATE] > SEARCHING, ended, going))
+    following = ca.Function("narrow", [s, f, slope], [result], ["s", "f", "slope"], ["s_next"])
+
+    f0, s0, reach, f1, s1 = (ca.SX.sym(n) for n in ("f0", "s0", "reach", "f1", "s1"))
+    ahead = f0 > 0  # a law's first input may have moved the margin beyond the stop: then only the sign before it is of use
+    v0, r0 = _usable(f0, s0)
+    low = [ca.SX(0), ca.if_else(ahead, v0, 1), ca.if_else(ahead, r0, 0)]
+    high = [reach, *_usable(f1, s1)]
+    cubic, good = _inverse_cubic(low, high)
+    trial = ca.if_else(good, cubic, 0.5 * reach)
+    first = ca.Function(
+        "bracket", [f0, s0, reach, f1, s1], [ca.cse(ca.vertcat(trial, *low, *high, SEARCHING, reach, CLOSE, 0))],
+        ["f_low", "slope_low", "high", "f_high", "slope_high"], ["s"],
+    )  # fmt: skip
+    return first, following
 
 
-def _step(a: Array, b: Array, c: Array, fa: Array, fb: Array, fc: Array) -> Array:
-    """Next trial as a fraction of the way from a to b: inverse quadratic interpolation inside Chandrupatla's region, else 1/2."""
-    safe = (fa != fb) & (fb != fc) & (fc != fa) & (b != c) & (a != b)
-    ab, bc, ca_ = (np.where(safe, d, 1.0) for d in (fb - fa, fb - fc, fc - fa))
-    xi, phi = (a - b) / np.where(safe, c - b, 1.0), ab / bc
-    inside = safe & (phi**2 < xi) & ((1 - phi) ** 2 < 1 - xi)
-    quadratic = fa / ab * fc / bc - (c - a) / np.where(safe, b - a, 1.0) * fa / ca_ * fb / bc
-    return np.where(inside, quadratic, 0.5)
+def _usable(f: ca.SX, slope: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Value and slope as finite numbers: of a value that is not finite the side remains, of a slope that is of no use zero."""
+    finite = ca.fabs(f) < ca.inf
+    falling = ca.logic_and(slope < 0, slope > -ca.inf)
+    return ca.if_else(finite, f, ca.if_else(f > 0, 1, -1)), ca.if_else(ca.logic_and(finite, falling), slope, 0)
+
+
+def _inverse_cubic(low: list[ca.SX], high: list[ca.SX]) -> tuple[ca.SX, ca.SX]:
+    """Zero of the inverse cubic through both ends [place, value, slope], and whether it is known to lie between them."""
+    drop, width = low[1] - high[1], high[0] - low[0]
+    known = ca.logic_and(low[2] < 0, high[2] < 0)
+    m0, m1 = (-drop / ca.if_else(end[2] < 0, end[2], -1) for end in (low, high))  # slopes of the inverse, per drop
+    part = low[1] / drop
+    rest = 1 - part
+    zero = low[0] + part * (width * part * (3 - 2 * part) + rest * (m0 * rest - m1 * part))
+    return zero, ca.logic_and(known, ca.logic_and(m0 <= 3 * width, m1 <= 3 * width))
+
+
+@lru_cache(maxsize=64)
+def stopping(group: ca.Function, prepare: ca.Function, model: Model, until: Stop, *, held: bool) -> tuple[ca.Function, Stopping]:
+    """Margin (c, p) -> scalar after a group made by :func:`ocp.flight.group_function`, and the search for its zero inside one.
+
+    The margin is NaN where an output of the conditions is.  `held`: the input is held over a group.
+    """
+    sizes = {name: group.size1_in(i) for i, name in enumerate("cqp")} | {"s": 11, "1": 1}
+    nx, nu = len(model.states), len(model.inputs)
+    x, u, p, dx, du = (ca.SX.sym(n, k) for n, k in (("x", nx), ("u", nu), ("p", sizes["p"]), ("dx", nx), ("du", nu)))
+    least = ca.densify(until.expression(model, x, u, p))
+    margin = ca.Function(f"{model.name}_margin", [x, u, p], [least])
+    slope = ca.jtimes(least, ca.vertcat(x, u), ca.vertcat(dx, du)) if nx + nu else ca.SX(0)
+    rated = ca.Function(f"{model.name}_margin_rate", [x, u, p, dx, du], [least, ca.densify(slope)])
+    first, following = narrowing()
+    kind: Any = ca.SX if group.is_a("SXFunction") else ca.MX
+    c, after, q, p, s, reach = (kind.sym(n, sizes[size]) for n, size in zip(("c", "after", "q", "p", "s", "reach"), "ccqps1", strict=True))
+
+    def split(carry: Any) -> tuple[Any, Any]:
+        return carry[:nx, :], carry[carry.shape[0] - nu :, :]
+
+    ends = prepare(c, q, p)[2]
+    change = kind.zeros(nu, 1) if held else ends[nu:, :] - ends[:nu, :]
+
+    def rate(state: Any, control: Any) -> list[Any]:
+        return rated.call([state, control, p, q[1] * model.rhs(state, control, p), change])
+
+    low, high = rate(c[:nx, :], ends[:nu, :]), rate(*split(after))
+    at = group(c, partial(q, s[TRIAL], nu, held=held), p)[0]
+    names = ["c", "after", "q", "p", "reach"]
+    after_group = ca.Function(f"{model.name}_margin", [c, p], [margin(*split(c), p)], ["c", "p"], ["margin"])
+    return after_group, Stopping(
+        ca.Function(f"{model.name}_start", [c, q, p], [margin(c[:nx, :], ends[:nu, :], p)], ["c", "q", "p"], ["margin"]),
+        ca.Function(f"{model.name}_bracket", [c, after, q, p, reach], [first(*low, reach, *high)], names, ["s"]),
+        ca.Function(f"{model.name}_probe", [c, q, p, s], [at, following(s, *rate(*split(at)))], ["c", "q", "p", "s"], ["c_at", "s_next"]),
+        STATE,
+    )
+
+
+def partial(q: Any, fraction: Any, nu: int, *, held: bool) -> Any:
+    """Queue entry (2 + nw,) of the first `fraction` of a group: less time, and of a linear input the part it has run through by then.
+
+    Also for arrays, (2 + nw, M) and (M,).
+    """
+    stack = np.vstack if isinstance(q, np.ndarray) else lambda rows: ca.vertcat(*rows)
+    rest = [q[2:, :]] if held else [q[2 : 2 + nu, :], q[2 : 2 + nu, :] + fraction * (q[2 + nu :, :] - q[2 : 2 + nu, :])]
+    return stack([q[:1, :], q[1:2, :] * fraction, *rest])

@@ -9,6 +9,7 @@ import pytest
 import models
 import ocp
 from models.core import ModelError, Status, Var, define
+from models.native import native_available
 from ocp import flight
 
 CAPSULE = models.Vehicle("capsule", 2900.0, 3.8, 0.35, 1.34)
@@ -233,3 +234,75 @@ def test_native_modes_that_cannot_be_are_refused():
     for wrong in ({"native": "fast", "samples": True}, {"native": "accurate", "method": ocp.Adaptive()}, {"native": "yes"}):
         with pytest.raises(ModelError, match="native"):
             ocp.simulate_ensemble(model, law, x0=x0, until=STOP, **wrong)
+
+
+NEEDS_COMPILER = pytest.mark.skipif(not native_available(), reason="no C compiler on this machine")
+UNTIL = {
+    "state": ocp.falls_below("h", 30e3),
+    "output": ocp.falls_below("mach", 12.0),
+    "either": ocp.first_of(ocp.falls_below("h", 30e3), ocp.rises_above("load", 2.5)),
+}
+
+
+@NEEDS_COMPILER
+@pytest.mark.parametrize("until", UNTIL)
+@pytest.mark.parametrize("law", laws(), ids=lambda law: law.name)
+def test_stops_are_bit_equal_in_interpreter_and_accurate_mode(law, until):
+    model = models.entry_planar(CAPSULE, atmosphere=models.us76_smooth())
+    x0, p = cases(model, 29)
+    options = {"x0": x0, "p": p, "until": UNTIL[until], "t_max": 900.0, "method": ocp.RK4(step=1.0)}
+    wanted = ocp.simulate_ensemble(model, law, native="off", **options)
+    found = ocp.simulate_ensemble(model, law, native="accurate", **options)
+    fast = ocp.simulate_ensemble(model, law, native="fast", **options)
+    assert wanted.ok.sum() > 20
+    assert found.status == wanted.status == fast.status
+    assert np.array_equal(found.t, wanted.t)
+    assert np.array_equal(found.x, wanted.x)
+    np.testing.assert_allclose(fast.t, wanted.t, rtol=1e-9)
+    np.testing.assert_allclose(fast.x, wanted.x, rtol=1e-9, atol=1e-9)
+
+
+@NEEDS_COMPILER
+@pytest.mark.parametrize("mode", ["accurate", "fast"])
+def test_stops_do_not_depend_on_the_cases_beside(mode):
+    model = models.entry_planar(CAPSULE)
+    x0, p = cases(model, 75)
+    options = {"until": STOP, "t_max": 900.0, "method": ocp.RK8(step=20.0), "native": mode}
+    law = ocp.constant(lift_ratio=0.15)
+    whole = ocp.simulate_ensemble(model, law, x0=x0, p=p, **options)
+    for size in (1, 7, 32):
+        parts = [ocp.simulate_ensemble(model, law, x0=x0[i : i + size], p=p[i : i + size], **options) for i in range(0, 75, size)]
+        assert np.array_equal(np.concatenate([part.x for part in parts]), whole.x)
+        assert np.array_equal(np.concatenate([part.t for part in parts]), whole.t)
+    order = np.random.default_rng(3).permutation(75)
+    assert np.array_equal(ocp.simulate_ensemble(model, law, x0=x0[order], p=p[order], **options).x, whole.x[order])
+
+
+@pytest.mark.parametrize("native", ["off", pytest.param("fast", marks=NEEDS_COMPILER)])
+def test_the_stop_is_met_where_it_is_said(native):
+    """Long steps: one more integration of the last part with short steps ends at the stop altitude."""
+    model = models.entry_planar(CAPSULE)
+    x0, p = cases(model, 12)
+    law = ocp.constant(lift_ratio=0.15)
+    many = ocp.simulate_ensemble(model, law, x0=x0, p=p, until=STOP, method=ocp.RK8(step=10.0), native=native)
+    assert many.ok.all()
+    height = STOP.conditions[0][1]
+    assert many["h"] == pytest.approx(np.full(12, height), rel=1e-10)
+    for i in range(12):
+        one = ocp.simulate(model, law, x0=x0[i], p=p[i], t_max=float(many.t[i]), method=ocp.RK8(step=1.0))
+        assert many.x[i] == pytest.approx(one.x[-1], rel=1e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize("native", ["off", pytest.param("accurate", marks=NEEDS_COMPILER)])
+def test_a_linear_profile_is_followed_to_the_stop(native):
+    """y' = u with u = t: the stop y = 2 is at t = 2, whatever the step, in the middle of a group."""
+    model = define("ramp", lambda x, u, p: {"y": u.a}, states=[Var("y")], inputs=[Var("a")])
+    for step in (0.3, 0.7, 1.9):
+        law = ocp.profile([0.0, 10.0], a=[0.0, 10.0])
+        flown = ocp.simulate_ensemble(
+            model, law, x0=np.zeros((3, 1)), until=ocp.rises_above("y", 2.0), t_max=9.0, method=ocp.RK4(step=step), native=native
+        )  # fmt: skip
+        assert flown.t == pytest.approx([2.0] * 3, rel=1e-11)
+        one = ocp.simulate(model, law, x0=[0.0], until=ocp.rises_above("y", 2.0), t_max=9.0, method=ocp.RK4(step=step))
+        assert one.t[-1] == pytest.approx(2.0, rel=1e-11)
+        assert one.u[-1, 0] == pytest.approx(2.0, rel=1e-11)
