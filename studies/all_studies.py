@@ -26,6 +26,8 @@ class Order:
 # Module (imported only when it is run) and its call; a new study is one more line.
 STUDIES: tuple[tuple[str, Callable[[Any, Order], StudyResult]], ...] = (
     ("studies.gains", lambda study, order: study.run(order.scenario, dispersions=order.cases, progress=order.progress).result()),
+    ("studies.modulators", lambda study, order: study.run(progress=order.progress).result()),
+    ("studies.jetloop", lambda study, order: study.run(loops=100_000 if order.full else 10_000, progress=order.progress).result()),
 )
 
 

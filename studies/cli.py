@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from studies import cli_campaign, console
+from studies import cli_campaign, cli_jetloop, cli_modulator, console
 from studies.console import Code, InputError
 
 if TYPE_CHECKING:
@@ -32,6 +32,8 @@ app = typer.Typer(
     epilog="Exit codes: 0 done, 2 wrong input, 3 some cases failed, 4 machine (disk, permission, missing part), 130 interrupted.",
 )  # fmt: skip
 app.add_typer(cli_campaign.app)
+app.add_typer(cli_jetloop.app)
+app.add_typer(cli_modulator.app)
 
 ScenarioFile = Annotated[
     Path | None,
