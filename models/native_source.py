@@ -14,6 +14,7 @@ from typing import Any
 import casadi as ca
 
 from models.native_spline import literal, spline_of
+from models.native_tensor import quicker
 from models.native_vector import prologue
 
 PART = 2500  # instructions in one C function: compilers take more than linear time over longer ones, and each end costs stores and loads
@@ -58,11 +59,11 @@ NO_C = ("CvodesInterface", "IdasInterface")  # CasADi would write C for them tha
 
 
 def scalar_code(functions: Sequence[ca.Function], *, unit: str) -> str:
-    """CasADi's own C code of the functions (already dense, and named with the prefix)."""
+    """CasADi's own C code of the functions (already dense, and named with the prefix), with its spline tables made quicker."""
     generator = ca.CodeGenerator(unit, {"with_header": False})
     for function in functions:
         generator.add(function)
-    return str(generator.dump())
+    return quicker(str(generator.dump()))
 
 
 @dataclass(slots=True)
@@ -147,13 +148,15 @@ class Unit:
                 expanded = function.expand()
             except RuntimeError:
                 return self.scalar_function(function)
-            if function.__hash__() in {g.__hash__() for g in expanded.find_functions(0)}:  # it only calls itself
+            if _calls(expanded, function):  # it cannot be expanded
                 return self.scalar_function(function)
             function = expanded
         if function.n_instructions() > LARGEST:
             raise Unsupported(f"it has {function.n_instructions()} instructions, more than {LARGEST}")
         symbols = function.sx_in()
         shared = ca.Function(name, symbols, ca.cse(function.call(symbols)))  # equal subexpressions once: the same numbers
+        if _calls(shared, function):  # one that is never to be inlined: what was made only calls it
+            shared = function
         self.kept.append(shared)
         self.text.append(_Writer(self, shared, name).code())
         return name
@@ -317,6 +320,11 @@ def _template(op: int) -> str:
             return table[op]
     known = [name for name in dir(ca) if name.startswith("OP_") and getattr(ca, name) == op]
     raise Unsupported(f"it contains the operation {known[0] if known else op}")
+
+
+def _calls(outer: ca.Function, inner: ca.Function) -> bool:
+    """True if `outer` contains a call of the very function `inner`."""
+    return inner.__hash__() in {g.__hash__() for g in outer.find_functions(0)}
 
 
 def _positions(sparsity: ca.Sparsity) -> list[int]:

@@ -185,6 +185,19 @@ def test_names_of_functions_and_inputs_do_not_matter(name):
 
 
 @needs_compiler
+@pytest.mark.parametrize("mode", ["accurate", "fast"])
+def test_functions_that_are_never_inlined_run_in_lanes(mode):
+    x = ca.SX.sym("x", 2)
+    inner = ca.Function("inner", [x], [ca.vertcat(ca.sin(x[0]) * x[1], x[0] - x[1])], {"never_inline": True})
+    outer = ca.Function("outer", [x], [inner(inner(x)) + x])
+    points = np.random.default_rng(4).normal(size=(9, 2))
+    for function in (inner, outer):
+        compiled = native.compile(function, mode=mode, lanes=4)
+        assert compiled.backend == "lanes"
+        assert compiled(points)[0] == pytest.approx(evaluate(function, points)[0], rel=FAST)
+
+
+@needs_compiler
 def test_sparse_empty_and_constant_results():
     x = ca.SX.sym("x", 3)
     sparse = ca.SX(3, 2)

@@ -1,0 +1,310 @@
+"""Many bounded weighted least-squares problems at once: the active-set steps compiled, one problem in each lane."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from allocation import active_set
+from models import native
+from models.checked import Array, ModelError, as_finite, evaluate, frozen
+
+STRIDE = 12  # every 12th problem is solved first; the others start between their neighbours
+FEW = 64  # below, problems are solved one after the other as they come: nothing to gain from neighbours
+WORTH_COMPILING = 1000  # problems; compiling takes seconds the first time
+CHAIN = 50  # samples of a history in one call
+LONG = 20_000  # samples of a history worth compiling: its steps stop as soon as they may in the interpreter as well
+LINKS = 16  # steps for each of them at most
+WIDE = 16  # effectors above which a round has one thorough step instead of three: the code would be too long
+ROUNDS = 40  # rounds of one to eight steps before a problem is given up
+
+Call = Callable[..., tuple[Array, ...]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solutions:
+    """Answers to N problems.
+
+    Attributes
+    ----------
+    u : ndarray, shape (N, n)
+    y : ndarray, shape (N, m)
+        Prices W^2 (v - B u): the warm start of the next call.
+    kkt : ndarray, shape (N, 3)
+        Primal, dual, gap (:func:`allocation.active_set.kkt`).
+    solved : ndarray of bool, shape (N,)
+        Each KKT residual at most 1e-9.
+    """
+
+    u: Array
+    y: Array
+    kkt: Array
+    solved: np.ndarray
+
+
+def solve_many(
+    B: Array, demand: Array, *, lower: Array, upper: Array, axis_weight: Array, effector_weight: Array, preferred: Array,
+    y: Array | None = None, compiled: bool | None = None,
+) -> Solutions:  # fmt: skip
+    """Solve min sum W^2 (B u - v)^2 + sum b^2 (u - p)^2 over lower <= u <= upper for N problems.
+
+    Parameters
+    ----------
+    B : ndarray, shape (m, n) or (N, m, n)
+    demand : ndarray, shape (N, m)
+        In the order of time if they follow each other: neighbours help each other.
+    lower, upper, effector_weight, preferred : ndarray, shape (n,) or (N, n)
+    axis_weight : ndarray, shape (m,) or (N, m)
+        Weights W and b, all > 0.
+    y : ndarray, shape (N, m), optional
+        Warm start.
+    compiled : bool, optional
+        Compiled or interpreted; by the number of problems unless given.
+
+    Raises
+    ------
+    ModelError
+        A shape that does not fit, NaN, a weight that is not positive, crossed limits.
+    """
+    columns = _columns(B, demand, lower, upper, axis_weight, effector_weight, preferred)
+    N, m, n = len(demand), demand.shape[1], B.shape[-1]
+    kit = _kit(m, n, N >= WORTH_COMPILING if compiled is None else compiled)
+    return _solve(kit, columns, (N, m, n), None if y is None else as_finite("solve_many: y", y).reshape(N, m))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FixedSolver:
+    """A solver for effectors, limits and weights that do not change: they are written into the compiled code; use :func:`fixed`.
+
+    About twice as fast as :func:`solve_many`, and compiled anew for every other matrix.
+    """
+
+    m: int
+    n: int
+    kit: _Kit
+
+    def __call__(self, demand: Array, y: Array | None = None) -> Solutions:
+        """Solutions for demands (N, m) in the order of time; warm start y (N, m).
+
+        Raises
+        ------
+        ModelError
+            A wrong shape, NaN.
+        """
+        values = np.ascontiguousarray(as_finite("fixed solver: demand", demand))
+        if values.ndim != 2 or values.shape[1] != self.m or not values.size:
+            raise ModelError(f"fixed solver: demand has shape {np.shape(demand)}, expected (N, {self.m})")
+        start = None if y is None else as_finite("fixed solver: y", y).reshape(values.shape)
+        return _solve(self.kit, [values], (len(values), self.m, self.n), start)
+
+
+def fixed(
+    B: Array, *, lower: Array, upper: Array, axis_weight: Array, effector_weight: Array, preferred: Array, compiled: bool = True
+) -> FixedSolver:
+    """A solver for one B, limits and weights; arguments as for :func:`solve_many` without the leading axis."""
+    data = _columns(B, np.zeros((1, np.shape(B)[0])), lower, upper, axis_weight, effector_weight, preferred)
+    if any(c.ndim != 1 for c in (data[0], *data[2:])):
+        raise ModelError("fixed: B, limits and weights must be those of one problem, without a leading axis")
+    m, n = np.shape(B)
+    given = active_set.constants(
+        np.asarray(B, dtype=float), lower=data[2], upper=data[3], axis_weight=data[4], effector_weight=data[5], preferred=data[6]
+    )
+    return FixedSolver(m, n, _make_kit(given, compiled))
+
+
+def _solve(kit: _Kit, columns: list[Array], size: tuple[int, int, int], y: Array | None) -> Solutions:
+    N, m, _ = size
+    start = _start(kit, columns, N, m) if y is None else y
+    u, prices, residuals = kit.ending(*columns, start)
+    solved = residuals.max(axis=1) <= active_set.TOLERANCE
+    for thorough in (False, True):  # at last from the beginning, with exact line searches
+        left = np.flatnonzero(~solved)
+        if not left.size:
+            break
+        picked = _pick(columns, left)
+        again = _steps(kit, picked, np.zeros((left.size, m)) if thorough else start[left], thorough=thorough)
+        u[left], prices[left], residuals[left] = kit.ending(*picked, again)
+        solved[left] = residuals[left].max(axis=1) <= active_set.TOLERANCE
+    for array in (u, prices, residuals):
+        array.flags.writeable = False
+    return Solutions(u, prices, residuals, solved)
+
+
+def solve_history(
+    B: Array, demand: Array, *, lower: Array, upper: Array, axis_weight: Array, effector_weight: Array, preferred: Array, room: Array,
+    start: Array, compiled: bool | None = None,
+) -> Solutions:  # fmt: skip
+    """As :func:`solve_many` for problems that follow each other: each command within `room` of the one before.
+
+    Parameters
+    ----------
+    room : ndarray, shape (n,)
+        Largest change from one sample to the next; infinite where nothing limits it.
+    start : ndarray, shape (n,)
+        Commands before the first sample.
+
+    Notes
+    -----
+    A command that lies beyond limits that have moved comes back as fast as it may.  CHAIN samples are one call; a sample that
+    the steps in it do not solve is solved alone, with exact line searches, and the chain goes on behind it.
+    """
+    columns = _columns(B, demand, lower, upper, axis_weight, effector_weight, preferred)
+    N, m, n = len(demand), demand.shape[1], B.shape[-1]
+    native_wanted = N >= LONG if compiled is None else compiled
+    chain, kit = _chain(m, n, native_wanted), _kit(m, n, native_wanted)
+    before = as_finite("solve_history: start", start)
+    span = float(np.max(columns[3] - columns[2])) + 1.0 + float(np.max(np.abs(before)))
+    room = np.minimum(np.where(np.isinf(room), 2 * span, room), 2 * span)
+    rows = np.hstack([np.broadcast_to(np.atleast_2d(c), (N, c.shape[-1])) for c in columns])
+    rows = np.vstack([rows, np.repeat(rows[-1:], CHAIN, axis=0)])  # always whole parts; the last row again
+    table, carry, k = np.empty((N, n + m + 3)), np.concatenate([before, np.zeros(m)]), 0
+    while k < N:
+        part = chain(carry, rows[k : k + CHAIN].ravel(), room)[0].reshape(CHAIN, -1)[: N - k]
+        bad = np.flatnonzero(~(part[:, n + m :].max(axis=1) <= active_set.TOLERANCE))
+        good = int(bad[0]) if bad.size else len(part)
+        table[k : k + good] = part[:good]
+        if bad.size:
+            last = part[good - 1, :n] if good else carry[:n]
+            problem = [c[k + good] if c.ndim == 2 else c for c in columns]
+            problem[1], (problem[2], problem[3]) = problem[1][None], within(problem[2], problem[3], last, room)
+            alone = kit.ending(*problem, _steps(kit, problem, np.zeros((1, m)), thorough=True))
+            table[k + good] = np.concatenate([result[0] for result in alone])
+            good += 1
+        k += good
+        carry = table[k - 1, : n + m]
+    kkt = table[:, n + m :]
+    return Solutions(frozen(table[:, :n]), frozen(table[:, n : n + m]), frozen(kkt), kkt.max(axis=1) <= active_set.TOLERANCE)
+
+
+def within(lower: Array, upper: Array, before: Array, room: Array) -> tuple[Array, Array]:
+    """Limits that are left for the next sample; a command beyond limits that have moved comes back as fast as it may."""
+    low = np.minimum(np.maximum(lower, before - room), before + room)
+    high = np.maximum(np.minimum(upper, before + room), before - room)
+    return low, high
+
+
+@lru_cache(maxsize=32)
+def _chain(m: int, n: int, compiled: bool) -> Call:
+    """(u and y, CHAIN rows of problem data, room) -> CHAIN rows of u, y, kkt.
+
+    Each step is a call behind a branch: a sample costs the steps that it needs, and the C code holds them once.
+    """
+    given = active_set.symbols(m, n)
+    newton, end = active_set.steps(given, count=1, name="wls_step"), active_set.ending(given)
+    inputs = newton.mx_in()
+    as_it_is = ca.Function("wls_hold", inputs, [inputs[-1], ca.MX(1.0)])
+    once = ca.Function.if_else("wls_once", newton, as_it_is)
+    carry, row, room = ca.MX.sym("carry", n + m), ca.MX.sym("row", sum(c.numel() for c in given[0])), ca.MX.sym("room", n)
+    data = ca.vertsplit(row, list(np.cumsum([0, *(c.numel() for c in given[0])])))
+    before, y = carry[:n], active_set.usable(carry[n:])
+    data[2], data[3] = (
+        ca.fmin(ca.fmax(data[2], before - room), before + room), ca.fmax(ca.fmin(data[3], before + room), before - room)
+    )  # fmt: skip
+    settled = ca.MX(0.0)
+    for _ in range(LINKS):
+        y, settled = once(settled == 0, *data, y)
+    u, y, kkt = end(*data, y)
+    sample = ca.Function("wls_sample", [carry, row, room], [ca.vertcat(u, y), ca.vertcat(u, y, kkt)])
+    rows = ca.MX.sym("rows", row.numel() * CHAIN)
+    _, found = sample.mapaccum("wls_chain", CHAIN)(carry, ca.reshape(rows, -1, CHAIN), ca.repmat(room, 1, CHAIN))
+    chain = ca.Function("wls_history", [carry, rows, room], [ca.vec(found)], ["carry", "rows", "room"], ["found"])
+    if not compiled:
+        return lambda *arguments: evaluate(chain, *arguments)
+    return native.compile(chain, lanes=1, threads=1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Kit:
+    """Functions of one size, compiled or interpreted."""
+
+    first: Call
+    more: Call
+    thorough: Call
+    ending: Call
+
+
+@lru_cache(maxsize=32)
+def _kit(m: int, n: int, compiled: bool) -> _Kit:
+    return _make_kit(active_set.symbols(m, n), compiled)
+
+
+def _make_kit(given: active_set.Given, compiled: bool) -> _Kit:
+    n = given[1].B.shape[1]
+    functions = {
+        "first": active_set.steps(given, count=2),
+        "more": active_set.steps(given, count=1, name="wls_step"),
+        "thorough": active_set.steps(given, count=3 if n <= WIDE else 1, searches=8, name="wls_thorough"),
+        "ending": active_set.ending(given),
+    }
+    return _Kit(**{name: _Lazy(f, compiled) for name, f in functions.items()})
+
+
+class _Lazy:
+    """A function that is compiled when it is first called."""
+
+    def __init__(self, function: ca.Function, compiled: bool) -> None:
+        self.function, self.compiled = function, compiled
+        self.native: native.Native | None = None
+
+    def __call__(self, *arguments: Array) -> tuple[Array, ...]:
+        if not self.compiled:
+            return evaluate(self.function, *arguments)
+        if self.native is None:
+            self.native = native.compile(self.function, mode="fast")
+        return self.native(*arguments)
+
+
+def _columns(*values: Array) -> list[Array]:
+    """Checked problem data in the order of ``active_set.PROBLEM``; B by columns."""
+    names = active_set.PROBLEM
+    data = [as_finite(f"solve_many: {name}", value) for name, value in zip(names, values, strict=True)]
+    B, demand = data[0], data[1]
+    if demand.ndim != 2 or not demand.size or B.ndim not in (2, 3) or B.shape[-2] != demand.shape[1]:
+        raise ModelError(f"solve_many: B has shape {B.shape} and demand {demand.shape}, expected (m, n) or (N, m, n), and (N, m)")
+    N, m, n = len(demand), demand.shape[1], B.shape[-1]
+    sizes = (None, m, n, n, m, n, n)
+    for name, value, size in zip(names[2:], data[2:], sizes[2:], strict=True):
+        if value.shape not in ((size,), (N, size)):
+            raise ModelError(f"solve_many: {name} has shape {value.shape}, expected ({size},) or ({N}, {size})")
+    if B.ndim == 3 and len(B) != N:
+        raise ModelError(f"solve_many: {len(B)} matrices B beside {N} demands; give one, or one for each")
+    for name in ("axis_weight", "effector_weight"):
+        if (data[names.index(name)] <= 0).any():
+            raise ModelError(f"solve_many: {name} has an entry that is not > 0; give small weights instead of zero")
+    if (data[2] > data[3]).any():
+        raise ModelError("solve_many: a lower limit is above its upper limit; correct the limits")
+    return [np.ascontiguousarray(np.swapaxes(B, -1, -2)).reshape(*B.shape[:-2], m * n), *data[1:]]
+
+
+def _pick(columns: Sequence[Array], rows: np.ndarray) -> list[Array]:
+    return [c[rows] if c.ndim == 2 else c for c in columns]
+
+
+def _steps(kit: _Kit, columns: Sequence[Array], y: Array, *, thorough: bool = False) -> Array:
+    """Steps until no effector changes on the full step, fewer and fewer problems in each round."""
+    y = y.copy()
+    rows = np.arange(len(y))
+    for round_ in range(ROUNDS):
+        function = kit.thorough if thorough or round_ > 2 else kit.first if round_ == 0 else kit.more
+        whole = rows.size == len(y)
+        y[rows], settled = function(*(columns if whole else _pick(columns, rows)), y if whole else y[rows])
+        rows = rows[settled[:, 0] == 0]
+        if not rows.size:
+            break
+    return y
+
+
+def _start(kit: _Kit, columns: Sequence[Array], N: int, m: int) -> Array:
+    """Prices to begin with: those of every 12th problem, and between them the straight line."""
+    if N <= FEW:
+        return _steps(kit, columns, np.zeros((N, m)))
+    knots = np.append(np.arange(0, N - 1, STRIDE), N - 1)
+    prices = _steps(kit, _pick(columns, knots), np.zeros((len(knots), m)))
+    at = np.minimum(np.arange(N) // STRIDE, len(knots) - 2)
+    part: Any = ((np.arange(N) - knots[at]) / np.diff(knots)[at])[:, None]
+    return prices[at] * (1 - part) + prices[at + 1] * part

@@ -1,0 +1,170 @@
+"""Command ``reentry allocate compare``: allocation methods side by side.  Only typer and the standard library are imported here."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from studies import console
+from studies.console import InputError
+
+if TYPE_CHECKING:
+    from allocation.compare import History
+    from studies.allocation import AllocationStudy
+
+app = typer.Typer(
+    name="allocate", no_args_is_help=True, help="Share a demanded force and moment out to jets and surfaces: methods compared.",
+)  # fmt: skip
+
+File = Path | None
+
+
+@app.callback()
+def group() -> None:
+    """Share a demanded force and moment out to jets and surfaces: methods compared."""
+
+
+@app.command()
+def compare(
+    scenario: Annotated[
+        str | None,
+        typer.Argument(metavar="[SCENARIO]", show_default=False, help="blend (recorded pitch demand of the STS-1 case) or three-axis."),
+    ] = None,
+    effectiveness: Annotated[
+        File, typer.Option("--effectiveness", metavar="B.csv", show_default=False, help="Own data: heading axis, then the effectors.")
+    ] = None,
+    limits: Annotated[
+        File,
+        typer.Option(
+            "--limits", metavar="L.csv", show_default=False, help="Own data: effector, lower, upper and, optionally, rate and flow."
+        ),
+    ] = None,
+    demand: Annotated[
+        File,
+        typer.Option("--demand", metavar="D.csv", show_default=False, help="Own data: t (optional) and the axes, one row for each sample."),
+    ] = None,
+    dt: Annotated[float | None, typer.Option("--dt", metavar="S", show_default=False, help="Sample time, if the demand has no t.")] = None,
+    methods: Annotated[
+        str | None,
+        typer.Option("--methods", metavar="A,B", show_default=False, help="Such as qp,osqp,redistributed,bound; all unless given."),
+    ] = None,
+    fail: Annotated[
+        list[str] | None,
+        typer.Option("--fail", metavar="NAME[=VALUE]", show_default=False, help="Effector that is off, or jammed at VALUE; repeatable."),
+    ] = None,
+    priority: Annotated[
+        list[str] | None, typer.Option("--priority", metavar="AXIS=FACTOR", show_default=False, help="Weight of an axis; repeatable.")
+    ] = None,
+    cost: Annotated[
+        list[str] | None, typer.Option("--cost", metavar="EFFECTOR=FACTOR", show_default=False, help="Cost of an effector; repeatable.")
+    ] = None,
+    slow: Annotated[int, typer.Option("--slow", min=1, max=100_000, help="Samples for each back end and the predictive method.")] = 200,
+    bound: Annotated[int, typer.Option("--bound", min=0, max=100_000, help="Samples for the mixed-integer bound; 0: without.")] = 100,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")] = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", show_default=False, help="Write JSON, table and figures into this folder.")
+    ] = None,
+) -> None:
+    """Compare allocation methods on one demand history: tracking, propellant, pulses, travel, optimality, time."""
+    failed, factors = _failures(fail or []), (_factors("--priority", priority or []), _factors("--cost", cost or []))
+    if out is not None:
+        from studies.files import check_folder
+
+        check_folder(out)
+    with console.work():
+        from studies import allocation
+
+        history = _history(scenario, effectiveness, limits, demand, dt)
+        chosen = None if methods is None else [part.strip() for part in methods.split(",") if part.strip()]
+        study = allocation.run(history, chosen=chosen, failed=failed, priority=factors[0], cost=factors[1], slow=slow, bound_samples=bound)
+        data = study.to_dict()
+    if out is not None:
+        _write(study, data, out)
+    if as_json:
+        console.print_text(console.to_json(data))
+    else:
+        _print(study)
+
+
+def _history(scenario: str | None, effectiveness: File, limits: File, demand: File, dt: float | None) -> History:
+    files = {"--effectiveness": effectiveness, "--limits": limits, "--demand": demand}
+    given = [name for name, path in files.items() if path is not None]
+    if dt is not None and (not math.isfinite(dt) or dt <= 0):
+        raise InputError(f"--dt: found {dt}, expected a sample time > 0 s")
+    from studies import allocation
+
+    if scenario is not None:
+        if given or dt is not None:
+            raise InputError(f"SCENARIO {scenario} and {(given or ['--dt'])[0]}: give a scenario or your own data, not both")
+        if scenario not in allocation.HISTORIES:
+            from models.checked import unknown_name
+
+            raise InputError(unknown_name("SCENARIO", scenario, allocation.HISTORIES))
+        return allocation.HISTORIES[scenario]()
+    missing = [name for name in files if name not in given]
+    if len(missing) == 3:
+        raise InputError(
+            f"nothing to compare: give a SCENARIO ({', '.join(allocation.HISTORIES)}), or --effectiveness, --limits and --demand"
+        )
+    if effectiveness is None or limits is None or demand is None:
+        raise InputError(f"{missing[0]}: not given, expected together with {' and '.join(given)}")
+    from studies.allocation_files import read_history
+
+    return read_history(effectiveness, limits, demand, dt=dt)
+
+
+def _failures(texts: list[str]) -> dict[str, float | None]:
+    found: dict[str, float | None] = {}
+    for text in texts:
+        name, sign, value = text.partition("=")
+        found[name.strip()] = _number("--fail", text, value) if sign else None
+    return found
+
+
+def _factors(option: str, texts: list[str]) -> dict[str, float]:
+    found = {}
+    for text in texts:
+        name, sign, value = text.partition("=")
+        if not sign:
+            raise InputError(f"{option}: found {text!r}, expected NAME=FACTOR such as M=10")
+        found[name.strip()] = _number(option, text, value)
+    return found
+
+
+def _number(option: str, text: str, value: str) -> float:
+    try:
+        number = float(value)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise InputError(f"{option}: found {text!r}, expected a finite number after the =")
+    return number
+
+
+def _print(study: AllocationStudy) -> None:
+    columns = ("method", "rms", "worst", "kg", "pulses", "deg", "KKT", "bad", "us", "n")
+    history = study.comparison.history
+    rows = [tuple(_cell(value) for value in row) for row in study.comparison.rows()]
+    console.print_table(f"{history.name}: {len(history)} samples, {len(history.effectors.names)} effectors", columns, rows)
+    console.print_text(
+        "rms, worst: error in parts of the largest demand on the axis; kg: propellant; deg: travel of the surfaces;\n"
+        "KKT: largest residual; bad: answers without a proof; us: time per solve; n: samples (compare kg only at the same n)."
+    )
+
+
+def _cell(value: Any) -> Any:
+    return f"{value:.3g}" if isinstance(value, float) else value
+
+
+def _write(study: AllocationStudy, data: dict[str, Any], out: Path) -> None:
+    from studies.figures import to_svg
+    from studies.files import folder
+
+    with console.work(), folder(out) as place:
+        (place / "allocation.json").write_text(console.to_json(data), encoding="utf-8")
+        for name, figure in study.figures().items():
+            (place / f"{name}.svg").write_text(to_svg(figure), encoding="utf-8")
+    console.say(f"wrote allocation.json and figures into {out}")

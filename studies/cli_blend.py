@@ -1,0 +1,138 @@
+"""Command ``reentry blend``: the STS-1 case of RCS/elevon blending.  Only typer and the standard library are imported here."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from studies import console
+from studies.console import Code, InputError
+
+if TYPE_CHECKING:
+    from studies.blend import BlendStudy
+
+Method = Annotated[str, typer.Option("--method", metavar="NAME", help="Allocation: paper, literal (equation 20 as printed), qp, or pinv.")]
+Jets = Annotated[int, typer.Option("--jets", help="Aft pitch jets in each direction: 2, 4 or 6.")]
+Stress = Annotated[float, typer.Option("--stress", metavar="DEG", help="Amplitude of the command added in the blending window, deg.")]
+Changes = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="NAME=VALUE", show_default=False,
+        help="Change the flown vehicle or its start, SI and rad, such as Cm_factor=1.2, cg_aft=0.05, wind_factor=1.5, h=74000; repeatable.",
+    ),
+]  # fmt: skip
+Low = Annotated[float, typer.Option("--q1", metavar="PA", help="Dynamic pressure at which the elevon begins to take part.")]
+High = Annotated[float, typer.Option("--q2", metavar="PA", help="Dynamic pressure at which the elevon has its full authority.")]
+Singles = Annotated[bool, typer.Option("--singles", help="Also fly the stress cases and the single dispersions.")]
+Cases = Annotated[int, typer.Option("--dispersions", min=0, max=100_000, help="Random dispersed flights, in compiled code.")]
+Compare = Annotated[bool, typer.Option("--compare", help="Fly the random dispersions under paper, qp and pinv, and compare.")]
+Seed = Annotated[int, typer.Option("--seed", min=0, help="Of the random dispersions.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
+OutFolder = Annotated[
+    Path | None, typer.Option("--out", metavar="DIR", show_default=False, help="Write JSON and figures into this folder.")
+]
+
+
+def blend(
+    method: Method = "paper",
+    jets: Jets = 6,
+    stress: Stress = 0.0,
+    changes: Changes = None,
+    q1: Low = 1000.0,
+    q2: High = 2500.0,
+    singles: Singles = False,
+    dispersions: Cases = 0,
+    compare: Compare = False,
+    seed: Seed = 2012,
+    as_json: AsJson = False,
+    out: OutFolder = None,
+) -> None:
+    """Fly the orbiter through the hand-over from reaction jets to the elevon (STS-1 case of paper 000)."""
+    given = _changes(changes or [])
+    if stress:
+        if not math.isfinite(stress):
+            raise InputError(f"--stress: found {stress}, expected an amplitude in deg, such as 2")
+        if "stress" in given:
+            raise InputError("--stress and --set stress=... name the same amplitude; give one of them")
+        given["stress"] = math.radians(stress)
+    if compare and dispersions < 2:
+        raise InputError(f"--compare: needs --dispersions of at least 2, found {dispersions}")
+    if out is not None:
+        from studies.files import check_folder
+
+        check_folder(out)
+    with console.work():
+        from allocation.blending import Handover
+        from studies import blend as study_of
+
+        study = study_of.run(
+            method=method, jets=jets, changes=given, singles=singles, cases=dispersions, seed=seed, handover=Handover(q1=q1, q2=q2)
+        )
+        data = study.to_dict()
+        methods = None
+        if compare:
+            from studies.blend_methods import compare as compare_methods
+
+            methods = compare_methods(cases=dispersions, seed=seed, jets=jets)
+            data["methods"] = methods.to_dict()
+    if out is not None:
+        _write(study, data, out)
+    for remark in study.remarks:
+        console.say(f"note: {remark}")
+    if as_json:
+        console.print_text(console.to_json(data))
+    else:
+        _print(study)
+        if methods is not None:
+            table = methods.table()
+            console.print_table(table.title, table.columns, table.rows)
+    for number in study.failed[:20]:
+        console.say(f"failed: case {number} of the dispersions: a number was not finite")
+    if study.failed:
+        raise typer.Exit(Code.CASES_FAILED)
+
+
+def _changes(texts: list[str]) -> dict[str, float]:
+    given = {}
+    for text in texts:
+        name, sign, value = text.partition("=")
+        try:
+            number = float(value)
+        except ValueError:
+            number = math.nan
+        if not sign or not name.strip() or not math.isfinite(number):
+            raise InputError(f"--set: found {text!r}, expected name=number such as Cm_factor=1.2")
+        if name.strip() in given:
+            raise InputError(f"--set: {name.strip()} is given twice; give it once")
+        given[name.strip()] = number
+    return given
+
+
+def _print(study: BlendStudy) -> None:
+    console.print_table(
+        f"Blending, method {study.method}, {study.jets} + {study.jets} jets", ("quantity", "value", "unit"), study.summary()
+    )
+    if study.singles:
+        from studies.blend_tables import singles_table
+
+        table = singles_table(study)
+        console.print_table(table.title, table.columns, table.rows)
+    if study.ensemble is not None:
+        from studies.blend_tables import ensemble_table
+
+        table = ensemble_table(study)
+        console.print_table(table.title, table.columns, table.rows)
+
+
+def _write(study: BlendStudy, data: dict[str, Any], out: Path) -> None:
+    from studies.figures import to_svg
+    from studies.files import folder
+
+    with console.work(), folder(out) as place:
+        (place / "blend.json").write_text(console.to_json(data), encoding="utf-8")
+        for name, figure in study.figures().items():
+            (place / f"{name}.svg").write_text(to_svg(figure), encoding="utf-8")
+    console.say(f"wrote blend.json and figures into {out}")
