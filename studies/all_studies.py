@@ -28,6 +28,8 @@ STUDIES: tuple[tuple[str, Callable[[Any, Order], StudyResult]], ...] = (
     ("studies.gains", lambda study, order: study.run(order.scenario, dispersions=order.cases, progress=order.progress).result()),
     ("studies.modulators", lambda study, order: study.run(progress=order.progress).result()),
     ("studies.jetloop", lambda study, order: study.run(loops=100_000 if order.full else 10_000, progress=order.progress).result()),
+    ("studies.blend", lambda study, order: study.run(singles=True, cases=order.cases).result()),
+    ("studies.allocation_report", lambda study, order: study.result(flights=max(2, order.cases))),
 )
 
 
