@@ -84,7 +84,7 @@ def group_of_steps(model: Model, method: Method, n: int, law_input: tuple[list[c
     name, arguments = f"{model.name}_group", [x, H, p, *symbols]
     if isinstance(method, Adaptive):
         return _adaptive_group(model, method, n, name, arguments, rate, control)
-    a, b, c = _tableau(method)
+    a, b, c = butcher(method)
     columns, inputs, state = [], [], x
     for k in range(n):
         state = runge_kutta(rate, state, H / n, ca.SX(k) / n, 1 / n, (a, b, c))
@@ -93,7 +93,8 @@ def group_of_steps(model: Model, method: Method, n: int, law_input: tuple[list[c
     return ca.Function(name, arguments, [ca.horzcat(*columns), ca.horzcat(*inputs)])
 
 
-def _tableau(method: RK4 | RK8) -> Tableau:
+def butcher(method: RK4 | RK8) -> Tableau:
+    """Butcher coefficients (a, b, c) of an explicit method."""
     if isinstance(method, RK4):
         a = np.zeros((4, 4))
         a[1, 0] = a[2, 1] = 0.5

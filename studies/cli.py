@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from studies import cli_allocate, cli_blend, cli_campaign, cli_jetloop, cli_modulator, console
+from studies import cli_allocate, cli_blend, cli_campaign, cli_jetloop, cli_landing, cli_modulator, console
 from studies.console import Code, InputError
 
 if TYPE_CHECKING:
@@ -36,6 +36,7 @@ app.add_typer(cli_jetloop.app)
 app.add_typer(cli_modulator.app)
 app.add_typer(cli_allocate.app)
 app.command()(cli_blend.blend)
+app.command()(cli_landing.land)
 
 ScenarioFile = Annotated[
     Path | None,

@@ -95,7 +95,7 @@ class Scenario(Section):
         values = self.model_dump(mode="json")
         for key, value in changes.items():
             parent, last, is_text = nested_key(type(self), values, key, origin)
-            plain = _plain(value)
+            plain = plain_values(value)
             if isinstance(plain, str) and not is_text:
                 plain = parse_value(plain, name=f"{origin}: {key}")
             parent[last] = plain
@@ -116,7 +116,7 @@ class Scenario(Section):
     def to_yaml(self) -> str:
         """Complete YAML text with the meaning of every key as a comment; :meth:`parse` gives the same scenario back."""
         head = ["# Scenario of an entry guidance study. Keys that are left out keep their default values.", ""]
-        return "\n".join(head + _yaml_lines(self, "")) + "\n"
+        return "\n".join(head + yaml_lines(self, "")) + "\n"
 
     def run(
         self, *, dispersions: int = 0, at: Sequence[float] | None = None, progress: Callable[[str, float], None] | None = None
@@ -142,18 +142,19 @@ def _checked(values: Any, *, where: Callable[[Place], str]) -> Scenario:
         raise ScenarioError(translate(Scenario, error, where)) from None
 
 
-def _plain(value: Any) -> Any:
+def plain_values(value: Any) -> Any:
     """NumPy scalars and arrays, and tuples, as plain Python values."""
     if isinstance(value, (np.ndarray, np.generic)):
         return value.tolist()
     if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: plain_values(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
+        return [plain_values(item) for item in value]
     return value
 
 
-def _yaml_lines(section: Section, indent: str) -> list[str]:
+def yaml_lines(section: Section, indent: str) -> list[str]:
+    """Lines of YAML text of a section and those in it, with the meaning of every key as a comment."""
     lines: list[str] = []
     for key, info in type(section).model_fields.items():
         value = getattr(section, key)
@@ -165,7 +166,7 @@ def _yaml_lines(section: Section, indent: str) -> list[str]:
         if isinstance(value, Section):
             if not indent and lines:
                 lines.append("")
-            lines += [f"{indent}# {text}", f"{indent}{key}:", *_yaml_lines(value, indent + "  ")]
+            lines += [f"{indent}# {text}", f"{indent}{key}:", *yaml_lines(value, indent + "  ")]
         else:
             line = f"{indent}{key}: {_yaml_value(value)}"
             lines += [f"{line}  # {text}"] if len(line) + len(text) < _WRAP else [f"{indent}# {text}", line]

@@ -17,13 +17,13 @@ Scale = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1e-9, le=1e9
 Four = tuple[Scale, Scale, Scale, Scale]
 
 
-def _key(default: Any, text: str, low: float, high: float, *, remedy: str = "") -> Any:
+def real_key(default: Any, text: str, low: float, high: float, *, remedy: str = "") -> Any:
     """A number with its closed range; `remedy` is the hint of an error message, usually about the unit."""
     return Field(default=default, ge=low, le=high, description=text, json_schema_extra={"remedy": remedy} if remedy else None)
 
 
 def _half_width(text: str, high: float, *, remedy: str = "") -> Any:
-    """As :func:`_key` without a default: each dispersion set has its own."""
+    """As :func:`real_key` without a default: each dispersion set has its own."""
     return Field(ge=0.0, le=high, description=text, json_schema_extra={"remedy": remedy} if remedy else None)
 
 
@@ -37,8 +37,8 @@ class Vehicle(Section):
     """The capsule as a point mass with constant lift and drag coefficients."""
 
     name: str = Field(default="N1", min_length=1, max_length=80, description="name of vehicle and flight, for headings")
-    lift_to_drag: Real = _key(0.25, "largest lift over drag, CL/CD", 0.01, 4.0)
-    ballistic_coefficient_kg_m2: Real = _key(450.0, "mass/(CD area)", 1.0, 1e5, remedy="in kg/m2: 1 lb/ft2 is 4.8824 kg/m2")
+    lift_to_drag: Real = real_key(0.25, "largest lift over drag, CL/CD", 0.01, 4.0)
+    ballistic_coefficient_kg_m2: Real = real_key(450.0, "mass/(CD area)", 1.0, 1e5, remedy="in kg/m2: 1 lb/ft2 is 4.8824 kg/m2")
 
     @field_validator("name")
     @classmethod
@@ -51,10 +51,10 @@ class Vehicle(Section):
 class Planet(Section):
     """A spherical planet that does not rotate."""
 
-    gravitational_parameter_m3_s2: Real = _key(
+    gravitational_parameter_m3_s2: Real = real_key(
         3.986004418e14, "gravitational parameter", 1e9, 1e18, remedy="in m3/s2: 1 km3/s2 is 1e9 m3/s2"
     )
-    radius_m: Real = _key(6371000.0, "radius", 1e5, 1e8, remedy="in metres: 6371 km is 6371000")
+    radius_m: Real = real_key(6371000.0, "radius", 1e5, 1e8, remedy="in metres: 6371 km is 6371000")
 
 
 class Atmosphere(Section):
@@ -63,8 +63,8 @@ class Atmosphere(Section):
     model: Literal["exponential", "us76_smooth"] = Field(
         default="exponential", description="exponential (with the two keys below), or us76_smooth (US Standard Atmosphere 1976, smoothed)"
     )
-    surface_density_kg_m3: Real = _key(1.225, "exponential: density at altitude 0", 1e-9, 1e3)
-    scale_height_m: Real = _key(
+    surface_density_kg_m3: Real = real_key(1.225, "exponential: density at altitude 0", 1e-9, 1e3)
+    scale_height_m: Real = real_key(
         7110.0, "exponential: altitude over which density falls by e", 500.0, 1e5, remedy="in metres: 7.11 km is 7110"
     )
 
@@ -82,16 +82,16 @@ class Atmosphere(Section):
 class Reference(Section):
     """The reference flight: entry state, constant bank angle and end."""
 
-    bank_deg: Real = _key(
+    bank_deg: Real = real_key(
         45.0, "constant bank angle (magnitude)", 0.0, 180.0, remedy="in degrees, as a magnitude: the planar flight has no side"
     )
-    altitude_m: Real = _key(100000.0, "altitude at entry", 20e3, 200e3, remedy="in metres: 100 km is 100000")
-    speed_m_s: Real = _key(7800.0, "speed at entry, planet-relative", 1000.0, 15000.0, remedy="in m/s: 7.8 km/s is 7800")
-    path_angle_deg: Real = _key(
+    altitude_m: Real = real_key(100000.0, "altitude at entry", 20e3, 200e3, remedy="in metres: 100 km is 100000")
+    speed_m_s: Real = real_key(7800.0, "speed at entry, planet-relative", 1000.0, 15000.0, remedy="in m/s: 7.8 km/s is 7800")
+    path_angle_deg: Real = real_key(
         -1.36, "flight-path angle at entry, negative downwards", -30.0, -0.1, remedy="in degrees, negative downwards: -0.0237 rad is -1.36"
     )
-    stop_altitude_m: Real = _key(10000.0, "altitude at which the flight ends", 0.0, 150e3, remedy="in metres: 10 km is 10000")
-    t_max_s: Real = _key(3000.0, "time after which a flight counts as skipped out", 10.0, 1e5)
+    stop_altitude_m: Real = real_key(10000.0, "altitude at which the flight ends", 0.0, 150e3, remedy="in metres: 10 km is 10000")
+    t_max_s: Real = real_key(3000.0, "time after which a flight counts as skipped out", 10.0, 1e5)
 
     @model_validator(mode="after")
     def _stop_below_entry(self) -> Reference:
@@ -117,7 +117,7 @@ class Weights(Section):
         default=(0.5, 750.0, 7500.0, 2000.0), description="scales of the deviation in flight",
         json_schema_extra={"components": ["n_x (g)", "hdot (m/s)", "s (m)", "sdot (m/s)"]},
     )  # fmt: skip
-    control: Real = _key(0.06, "scale of the correction of CL/CD cos(bank)", 1e-9, 1e9)
+    control: Real = real_key(0.06, "scale of the correction of CL/CD cos(bank)", 1e-9, 1e9)
 
     @field_validator("terminal", "state", mode="before")
     @classmethod
@@ -130,19 +130,19 @@ class Weights(Section):
 class PaperGains(Section):
     """Constant gains printed in the paper, in its own sign: correction = K1 dn_x + K2 dhdot + K3 ds + K4 dsdot."""
 
-    K1: Real = _key(-0.62, "gain of axial load (negative in flight), 1/g", -1e3, 1e3)
-    K2: Real = _key(-1.5e-3, "gain of altitude rate, s/m", -1e3, 1e3)
-    K3a: Real = _key(-5.2e-6, "gain of downrange before split_s, 1/m", -1e3, 1e3)
-    K3b: Real = _key(-2.2e-5, "gain of downrange from split_s on, 1/m", -1e3, 1e3)
-    K4: Real = _key(-7.5e-4, "gain of downrange rate, s/m", -1e3, 1e3)
+    K1: Real = real_key(-0.62, "gain of axial load (negative in flight), 1/g", -1e3, 1e3)
+    K2: Real = real_key(-1.5e-3, "gain of altitude rate, s/m", -1e3, 1e3)
+    K3a: Real = real_key(-5.2e-6, "gain of downrange before split_s, 1/m", -1e3, 1e3)
+    K3b: Real = real_key(-2.2e-5, "gain of downrange from split_s on, 1/m", -1e3, 1e3)
+    K4: Real = real_key(-7.5e-4, "gain of downrange rate, s/m", -1e3, 1e3)
 
 
 class Guidance(Section):
     """How the gains are flown."""
 
-    sample_s: Real = _key(1.0, "time between guidance commands", 0.01, 100.0)
-    gate_load_g: Real = _key(0.05, "axial load above which feedback is on", 0.0, 1.0, remedy="in g0")
-    split_s: Real = _key(400.0, "time at which K3 changes from K3a to K3b", 0.0, 1e5)
+    sample_s: Real = real_key(1.0, "time between guidance commands", 0.01, 100.0)
+    gate_load_g: Real = real_key(0.05, "axial load above which feedback is on", 0.0, 1.0, remedy="in g0")
+    split_s: Real = real_key(400.0, "time at which K3 changes from K3a to K3b", 0.0, 1e5)
     paper_gains: PaperGains = Field(default=PaperGains(), description="constants printed in the paper")
 
 
@@ -202,7 +202,7 @@ class Dispersions(Section):
 class Numerics(Section):
     """Accuracy."""
 
-    step_s: Real = _key(0.5, "integration step", 0.01, 5.0)
+    step_s: Real = real_key(0.5, "integration step", 0.01, 5.0)
 
 
 _SPREAD = "half-width of a uniform law, standard deviation of a normal one"
@@ -214,28 +214,28 @@ class PathAngleLaw(Section):
     """Law of the flight-path angle at entry."""
 
     law: Law = _LAW
-    spread: Real = _key(_LARGE.path_angle_deg, _SPREAD, 0.0, 5.0, remedy="in degrees")
+    spread: Real = real_key(_LARGE.path_angle_deg, _SPREAD, 0.0, 5.0, remedy="in degrees")
 
 
 class SpeedLaw(Section):
     """Law of the speed at entry."""
 
     law: Law = _LAW
-    spread: Real = _key(_LARGE.speed_m_s, _SPREAD, 0.0, 1000.0, remedy="in m/s")
+    spread: Real = real_key(_LARGE.speed_m_s, _SPREAD, 0.0, 1000.0, remedy="in m/s")
 
 
 class DensityLaw(Section):
     """Law of the density, as a fraction of the model's."""
 
     law: Law = _LAW
-    spread: Real = _key(_LARGE.density, _SPREAD, 0.0, 0.9, remedy=_FRACTION)
+    spread: Real = real_key(_LARGE.density, _SPREAD, 0.0, 0.9, remedy=_FRACTION)
 
 
 class CoefficientLaw(Section):
     """Law of an aerodynamic coefficient, as a fraction of the vehicle's."""
 
     law: Law = _LAW
-    spread: Real = _key(_LARGE.drag, _SPREAD, 0.0, 0.9, remedy=_FRACTION)
+    spread: Real = real_key(_LARGE.drag, _SPREAD, 0.0, 0.9, remedy=_FRACTION)
 
 
 class Distributions(Section):
@@ -246,8 +246,8 @@ class Distributions(Section):
     density: DensityLaw = Field(default=DensityLaw(), description="density, fraction")
     drag: CoefficientLaw = Field(default=CoefficientLaw(), description="drag coefficient, fraction")
     lift: CoefficientLaw = Field(default=CoefficientLaw(), description="lift coefficient, fraction")
-    wave_amplitude: Real = _key(0.0, "density wave along altitude, fraction (its phase is uniform)", 0.0, 0.9, remedy=_FRACTION)
-    wave_length_m: Real = _key(30000.0, "wave length of that wave", 1000.0, 1e6, remedy="in metres")
+    wave_amplitude: Real = real_key(0.0, "density wave along altitude, fraction (its phase is uniform)", 0.0, 0.9, remedy=_FRACTION)
+    wave_length_m: Real = real_key(30000.0, "wave length of that wave", 1000.0, 1e6, remedy="in metres")
 
 
 class Campaign(Section):

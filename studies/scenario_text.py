@@ -40,8 +40,8 @@ def dotted(place: Place) -> str:
     return text
 
 
-def read_text(path: Path) -> str:
-    """Text of a scenario file.
+def read_text(path: Path, *, command: str = "gains") -> str:
+    """Text of a scenario file; a missing one is answered with how `command` writes it.
 
     Raises
     ------
@@ -56,7 +56,7 @@ def read_text(path: Path) -> str:
         with path.open("rb") as stream:
             raw = stream.read(MAX_BYTES + 1)
     except (FileNotFoundError, NotADirectoryError):
-        raise ScenarioError(f"{path}: no such file; write one with: reentry gains --print-scenario > scenario.yaml") from None
+        raise ScenarioError(f"{path}: no such file; write one with: reentry {command} --print-scenario > scenario.yaml") from None
     if len(raw) > MAX_BYTES:
         raise ScenarioError(f"{path}: larger than {MAX_BYTES // 1000} kB, expected a scenario of a few kB; is this the right file?")
     try:
