@@ -197,14 +197,14 @@ def fly(
         raise ModelError(f"fly: {len(starts)} rows of x0 beside {len(params)} of p; give equal numbers, at least one")
     if native not in ("off", "accurate", "fast"):
         raise ModelError(f"fly: native: expected 'off', 'accurate' or 'fast', got {native!r}")
-    engine = flight.prepare(plant, guidance.law.bind(plant), RK4(step=step), t_max)
+    engine = flight.prepare(plant, guidance.law.bind(plant), RK4(step=step), t_max, until)
     blocks = []
     for first in range(0, len(starts), flight.BLOCK):
         rows = slice(first, first + flight.BLOCK)
         if native == "off":
-            outcome, _ = flight.fly_to_stop(engine, starts[rows], params[rows], until)
+            outcome, _ = flight.fly_to_stop(engine, starts[rows], params[rows])
         else:
-            outcome = fly_native(engine, starts[rows], params[rows], until, native)
+            outcome = fly_native(engine, starts[rows], params[rows], native)
         blocks.append(outcome)
         if progress is not None:
             progress(min(1.0, (first + flight.BLOCK) / len(starts)))
@@ -212,5 +212,5 @@ def fly(
     nx, nz = len(plant.states), len(guidance.memory)
     return Landings(
         frozen(np.concatenate([b.t for b in blocks])), frozen(c[:, :nx]), frozen(c[:, nx : nx + nz]),
-        frozen(guidance.target.miss(c[:, :3])), tuple(s for b in blocks for s in b.status), guidance,
+        frozen(guidance.target.miss(c[:, :3])), tuple(flight.STATUSES[s] for b in blocks for s in b.status), guidance,
     )  # fmt: skip

@@ -23,6 +23,11 @@ class Order:
     progress: Callable[..., None] | None
 
 
+def _at_most(cases: int, order: Order) -> int:
+    """Cases of a study whose flights are costly: no more than `cases` unless everything is asked for."""
+    return order.cases if order.full else min(order.cases, cases)
+
+
 # Module (imported only when it is run) and its call; a new study is one more line.
 STUDIES: tuple[tuple[str, Callable[[Any, Order], StudyResult]], ...] = (
     ("studies.gains", lambda study, order: study.run(order.scenario, dispersions=order.cases, progress=order.progress).result()),
@@ -30,6 +35,7 @@ STUDIES: tuple[tuple[str, Callable[[Any, Order], StudyResult]], ...] = (
     ("studies.jetloop", lambda study, order: study.run(loops=100_000 if order.full else 10_000, progress=order.progress).result()),
     ("studies.blend", lambda study, order: study.run(singles=True, cases=order.cases).result()),
     ("studies.allocation_report", lambda study, order: study.result(flights=max(2, order.cases))),
+    ("studies.landing", lambda study, order: study.run(cases=_at_most(300, order), progress=order.progress).result()),
 )
 
 

@@ -241,7 +241,7 @@ def create(path: Path, variables: Sequence[Variable], *, cases: int, chunk: int,
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # this part of the format is not in the standard yet, and xarray asks for it
             zarr.consolidate_metadata(memory, zarr_format=3)
-        for key, value in made.items():
+        for key, value in sorted(made.items(), key=lambda item: item[0] != "zarr.json"):  # first, by which sweep_around knows the folder
             (place / key).parent.mkdir(exist_ok=True)
             (place / key).write_bytes(value.to_bytes())
     return open_store(Path(path))
@@ -312,7 +312,7 @@ def sweep_around(path: Path) -> None:
     """Remove the private folder of a campaign that ended while it was making its store."""
     target = Path(os.path.abspath(path))
     for place in target.parent.glob(f".{target.name[:40]}.*.partial") if target.parent.is_dir() else ():
-        if place.is_dir() and (place / "zarr.json").is_file():
+        if place.is_dir() and ((place / "zarr.json").is_file() or not any(place.iterdir())):
             shutil.rmtree(place, ignore_errors=True)
 
 

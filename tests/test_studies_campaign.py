@@ -250,6 +250,7 @@ def test_resume_starts_a_campaign_and_sweeps_litter(original: Campaign, tmp_path
     half = tmp_path / ".store.abcdef.partial"  # a store that was being made when its campaign was killed
     half.mkdir()
     (half / "zarr.json").write_text("{}")
+    (tmp_path / ".store.ghijkl.partial").mkdir()  # killed before its first file
     done = campaign.run(small(), tmp_path / "store", resume=True)
     assert [entry.name for entry in tmp_path.iterdir()] == ["store"]
     litter = [done.path / "t_f" / "c" / "0.123.partial", done.path / "markers" / ".3.json.x.partial"]
