@@ -46,6 +46,9 @@ class AttainableSet:
     offsets: Array
     rank: int
 
+    def __repr__(self) -> str:
+        return f"AttainableSet(axes {self.effectors.axes}, {len(self.offsets)} facets, rank {self.rank})"
+
     def margin(self, wrench: ArrayLike) -> Array:
         """Least distance to a facet's plane in scaled axes, positive inside; shape () or (N,) for wrench (m,) or (N, m)."""
         values = self.effectors.demands(wrench) / self.scale

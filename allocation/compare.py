@@ -76,6 +76,10 @@ class History:
     def __len__(self) -> int:
         return len(self.demand)
 
+    def __repr__(self) -> str:
+        e = self.effectors
+        return f"History({self.name!r}: {len(self)} samples of {self.dt:g} s, axes {e.axes}, {len(e.names)} effectors)"
+
     @property
     def t(self) -> Array:
         """Times of the samples, s."""
@@ -260,6 +264,9 @@ class Comparison:
 
     history: History
     outcomes: tuple[Outcome, ...]
+
+    def __repr__(self) -> str:
+        return f"Comparison({', '.join(o.name for o in self.outcomes)}; {self.history!r})"
 
     def __getitem__(self, name: str) -> Outcome:
         for outcome in self.outcomes:

@@ -1,4 +1,4 @@
-"""Symbolic models of entry vehicles and their environment (CasADi)."""
+"""Symbolic models of entry vehicles, their environment, and their jets with modulators and limit cycles (CasADi)."""
 
 from models.atmosphere import Atmosphere, exponential, us76, us76_smooth
 from models.core import Model, ModelError, Status, Var, define

@@ -1,4 +1,4 @@
-"""Optimal control of symbolic models: simulation, trim, linearization, and gains with certificates."""
+"""Optimal control of symbolic models: simulation, trim, linearization, gains with certificates, landing at a point."""
 
 from ocp.coordinates import Coordinates, coordinates, transform
 from ocp.gains import Certificate, Gains

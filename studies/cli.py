@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     name="reentry", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
-    help="Atmospheric entry and jet control: certified gains, jet modulators, allocation, dispersed flights, reports.",
+    help="Atmospheric entry and jet control: certified gains, landing, jet modulators, allocation, dispersed flights, reports.",
     epilog="Exit codes: 0 done, 2 wrong input, 3 some cases failed, 4 machine (disk, permission, missing part), 130 interrupted.",
 )  # fmt: skip
 app.add_typer(cli_campaign.app)

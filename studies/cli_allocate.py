@@ -65,7 +65,7 @@ def compare(
     bound: Annotated[int, typer.Option("--bound", min=0, max=100_000, help="Samples for the mixed-integer bound; 0: without.")] = 100,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")] = False,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", show_default=False, help="Write JSON, table and figures into this folder.")
+        Path | None, typer.Option("--out", metavar="DIR", show_default=False, help="Write JSON and figures into this folder.")
     ] = None,
 ) -> None:
     """Compare allocation methods on one demand history: tracking, propellant, pulses, travel, optimality, time."""

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 DISTRIBUTION = "reentry-workbench"
 _REQUIRED = ("casadi", "numpy", "scipy", "matplotlib", "pydantic", "ruamel-yaml", "rich", "typer", "jinja2", "xarray")
-_PLANNED = ("osqp", "qpsolvers")  # installed with the workbench; nothing calls them before control allocation exists
+_ALLOCATION = ("osqp", "qpsolvers")  # installed with the workbench; only control allocation calls them
 _OPTIONAL = {
     "control": "comparisons with python-control",
     "daqp": "a further quadratic-programming solver",
-    "highspy": "a linear and mixed-integer solver",
+    "highspy": "a further quadratic-programming solver (HiGHS)",
     "nbclient": "running the notebooks",
 }
 
@@ -76,9 +76,9 @@ def _libraries() -> list[Check]:
         if name == "casadi" and found is not None and not found.startswith("3.8."):
             ok, detail = False, f"{found}; 3.8 is needed: pip install 'casadi>=3.8,<3.9'"
         checks.append(Check(name, ok, detail))
-    for name in _PLANNED:
+    for name in _ALLOCATION:
         found = _installed(name)
-        detail = f"{found}; for the planned control allocation, not used yet" if found else f"missing; install it with: pip install {name}"
+        detail = f"{found}; for control allocation" if found else f"missing; install it with: pip install {name}"
         checks.append(Check(name, found is not None, detail))
     for name, purpose in _OPTIONAL.items():
         found = _installed(name)

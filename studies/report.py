@@ -17,7 +17,7 @@ from studies import figures
 from studies.files import replace_folder, write_bytes, write_text
 from studies.result import Cell, Comparison, FigureItem, StudyResult, Table, as_plain, number
 
-TITLE = "Optimal control of atmospheric entry: study report"
+TITLE = "Atmospheric entry and jet control: study report"
 HALF_WIDTH_MM = 110.0  # figures up to this width stand two in a row
 SHOWN_FAILURES = 20  # more are counted, and listed in the data file
 
