@@ -200,6 +200,7 @@ def highs(p: Problem) -> Solve:
     solver = package.Highs()
     solver.setOptionValue("output_flag", False)
     solver.setOptionValue("qp_regularization_value", 0.0)
+    solver.setOptionValue("qp_iteration_limit", 2000)  # version 1.15 can go round for ever on 44 effectors
     solver.addVars(n, p.lower, p.upper)
     lower = sp.tril(sp.csc_matrix(p.H), format="csc")
     hessian = package.HighsHessian()
