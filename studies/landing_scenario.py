@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from pathlib import Path
-from typing import Any, Literal
+from typing import ClassVar, Literal
 
-from pydantic import ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field
 
-from studies.scenario import plain_values, yaml_lines
-from studies.scenario_errors import locate, nested_key, translate
+from studies.scenario_document import ScenarioDocument
 from studies.scenario_sections import Atmosphere, Real, Section, real_key
-from studies.scenario_text import Place, ScenarioError, parse_text, parse_value, read_text
 
 SetName = Literal["none", "density", "small", "medium", "hard"]
 LawName = Literal["paper", "modern"]
@@ -109,7 +105,7 @@ class LandingNumerics(Section):
     step_s: Real = real_key(0.25, "integration step of the truth; the bank servo needs half a second", 0.01, 0.5)
 
 
-class LandingScenario(Section):
+class LandingScenario(ScenarioDocument):
     """Everything of a landing study. Frozen.
 
     Examples
@@ -119,6 +115,9 @@ class LandingScenario(Section):
     """
 
     model_config = ConfigDict(title="Scenario of a landing study", hide_input_in_errors=False)
+    COMMAND: ClassVar[str] = "land"
+    SUBJECT: ClassVar[str] = "a landing study"
+    EMPTY_IS_DEFAULT: ClassVar[bool] = True
 
     vehicle: Vehicle = Field(default=Vehicle(), description="the capsule: a point mass with constant lift and drag coefficients")
     atmosphere: Atmosphere = Field(default=Atmosphere(), description="density against altitude, as assumed on board")
@@ -130,43 +129,3 @@ class LandingScenario(Section):
     guidance: LandingGuidance = Field(default=LandingGuidance(), description="the guidance law")
     dispersions: LandingDispersions = Field(default=LandingDispersions(), description="dispersed flights")
     numerics: LandingNumerics = Field(default=LandingNumerics(), description="accuracy of the flights")
-
-    @classmethod
-    def load(cls, path: str | Path) -> LandingScenario:
-        """Scenario of a YAML file; keys left out keep their defaults.
-
-        Raises
-        ------
-        ScenarioError
-            A file that is missing or unreadable, a wrong key or value: with file and line.
-        """
-        name = str(path)
-        values, lines = parse_text(read_text(Path(path), command="land"), name=name)
-        return _checked(values or {}, where=lambda place: locate(name, place, lines))
-
-    def edit(self, changes: Mapping[str, Any], *, origin: str = "edit") -> LandingScenario:
-        """Scenario with some dotted keys changed, such as ``{"dispersions.set": "medium"}``; see :meth:`studies.scenario.Scenario.edit`."""
-        values = self.model_dump(mode="json")
-        for key, value in changes.items():
-            parent, last, is_text = nested_key(type(self), values, key, origin)
-            plain = plain_values(value)
-            parent[last] = parse_value(plain, name=f"{origin}: {key}") if isinstance(plain, str) and not is_text else plain
-        return _checked(values, where=lambda place: origin)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Nested plain values, ready for JSON."""
-        return self.model_dump(mode="json")
-
-    def to_yaml(self) -> str:
-        """Complete YAML text with the meaning of every key as a comment."""
-        return (
-            "\n".join(["# Scenario of a landing study. Keys that are left out keep their default values.", "", *yaml_lines(self, "")])
-            + "\n"
-        )
-
-
-def _checked(values: Any, *, where: Callable[[Place], str]) -> LandingScenario:
-    try:
-        return LandingScenario.model_validate(values)
-    except ValidationError as error:
-        raise ScenarioError(translate(LandingScenario, error, where)) from None
