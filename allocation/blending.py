@@ -131,6 +131,13 @@ def paper(handover: Handover | None = None, *, name: str = "blend_paper") -> ca.
     return ca.Function(name, symbols, [part.elevon, duty, part.k_blend], list(INPUTS), list(OUTPUTS))
 
 
+def limits_arrays(qbar: Array, trim: Array, *, handover: Handover) -> tuple[Array, Array]:
+    """:func:`limits` for NumPy arrays that broadcast."""
+    h = handover
+    k = np.minimum(np.maximum((qbar - h.q1) / (h.q2 - h.q1), 0.0), 1.0)
+    return np.minimum(np.maximum(k * h.lower, h.lower - trim), 0.0), np.maximum(np.minimum(k * h.upper, h.upper - trim), 0.0)
+
+
 def share_arrays(demand: ArrayLike, qbar: ArrayLike, trim: ArrayLike, *, handover: Handover | None = None) -> tuple[Array, Array]:
     """:func:`share` for NumPy arrays that broadcast: (elevon, k_blend), bit for bit the numbers of the CasADi function.
 
@@ -141,9 +148,7 @@ def share_arrays(demand: ArrayLike, qbar: ArrayLike, trim: ArrayLike, *, handove
     """
     h = handover or Handover()
     p, q, t = np.broadcast_arrays(*(as_finite(f"blending: {n}", v) for n, v in zip(INPUTS, (demand, qbar, trim), strict=False)))
-    k = np.minimum(np.maximum((q - h.q1) / (h.q2 - h.q1), 0.0), 1.0)
-    low = np.minimum(np.maximum(k * h.lower, h.lower - t), 0.0)
-    high = np.maximum(np.minimum(k * h.upper, h.upper - t), 0.0)
+    low, high = limits_arrays(q, t, handover=h)
     p1 = np.minimum(np.maximum(p, low), high)
     k_blend = np.minimum(np.maximum(1.0 - np.abs(p1) / np.maximum(np.abs(p), h.floor), 0.0), 1.0)
     if h.rcs_inhibit_above_q2:

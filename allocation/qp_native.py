@@ -1,27 +1,22 @@
-"""Many bounded weighted least-squares problems at once: the active-set steps compiled, one problem in each lane."""
+"""Many bounded weighted least-squares problems: checked input, chains of neighbours, and histories with rate limits."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from allocation import active_set
+from allocation import active_set, qp_chain
 from models import native
 from models.checked import Array, ModelError, as_finite, evaluate, frozen
 
-STRIDE = 12  # every 12th problem is solved first; the others start between their neighbours
-FEW = 64  # below, problems are solved one after the other as they come: nothing to gain from neighbours
 WORTH_COMPILING = 1000  # problems; compiling takes seconds the first time
 CHAIN = 50  # samples of a history in one call
 LONG = 20_000  # samples of a history worth compiling: its steps stop as soon as they may in the interpreter as well
 LINKS = 16  # steps for each of them at most
-WIDE = 16  # effectors above which a round has one thorough step instead of three: the code would be too long
-ROUNDS = 40  # rounds of one to eight steps before a problem is given up
 
 Call = Callable[..., tuple[Array, ...]]
 
@@ -74,7 +69,7 @@ def solve_many(
     columns = _columns(B, demand, lower, upper, axis_weight, effector_weight, preferred)
     N, m, n = len(demand), demand.shape[1], B.shape[-1]
     kit = _kit(m, n, N >= WORTH_COMPILING if compiled is None else compiled)
-    return _solve(kit, columns, (N, m, n), None if y is None else as_finite("solve_many: y", y).reshape(N, m))
+    return _solve(kit, columns, N, None if y is None else as_finite("solve_many: y", y).reshape(N, m))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,7 +95,7 @@ class FixedSolver:
         if values.ndim != 2 or values.shape[1] != self.m or not values.size:
             raise ModelError(f"fixed solver: demand has shape {np.shape(demand)}, expected (N, {self.m})")
         start = None if y is None else as_finite("fixed solver: y", y).reshape(values.shape)
-        return _solve(self.kit, [values], (len(values), self.m, self.n), start)
+        return _solve(self.kit, [values], len(values), start)
 
 
 def fixed(
@@ -117,19 +112,12 @@ def fixed(
     return FixedSolver(m, n, _make_kit(given, compiled))
 
 
-def _solve(kit: _Kit, columns: list[Array], size: tuple[int, int, int], y: Array | None) -> Solutions:
-    N, m, _ = size
-    start = _start(kit, columns, N, m) if y is None else y
-    u, prices, residuals = kit.ending(*columns, start)
-    solved = residuals.max(axis=1) <= active_set.TOLERANCE
-    for thorough in (False, True):  # at last from the beginning, with exact line searches
-        left = np.flatnonzero(~solved)
-        if not left.size:
-            break
-        picked = _pick(columns, left)
-        again = _steps(kit, picked, np.zeros((left.size, m)) if thorough else start[left], thorough=thorough)
-        u[left], prices[left], residuals[left] = kit.ending(*picked, again)
-        solved[left] = residuals[left].max(axis=1) <= active_set.TOLERANCE
+def _solve(kit: _Kit, columns: list[Array], rows: int, y: Array | None) -> Solutions:
+    u, prices, residuals, solved = kit.chain.run(columns, rows, y)
+    left = np.flatnonzero(~solved)
+    if left.size:
+        u[left], prices[left], residuals[left] = kit.anew(qp_chain.pick(columns, left), left.size)
+        solved[left] = qp_chain.good(residuals[left])
     for array in (u, prices, residuals):
         array.flags.writeable = False
     return Solutions(u, prices, residuals, solved)
@@ -172,8 +160,7 @@ def solve_history(
             last = part[good - 1, :n] if good else carry[:n]
             problem = [c[k + good] if c.ndim == 2 else c for c in columns]
             problem[1], (problem[2], problem[3]) = problem[1][None], within(problem[2], problem[3], last, room)
-            alone = kit.ending(*problem, _steps(kit, problem, np.zeros((1, m)), thorough=True))
-            table[k + good] = np.concatenate([result[0] for result in alone])
+            table[k + good] = np.concatenate([result[0] for result in kit.anew(problem, 1)])
             good += 1
         k += good
         carry = table[k - 1, : n + m]
@@ -220,12 +207,17 @@ def _chain(m: int, n: int, compiled: bool) -> Call:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Kit:
-    """Functions of one size, compiled or interpreted."""
+    """Functions of one size: chains, compiled or not, and what solves the rare problem that they leave."""
 
-    first: Call
-    more: Call
-    thorough: Call
-    ending: Call
+    chain: qp_chain.Chain
+    thorough: ca.Function
+    ending: ca.Function
+
+    def anew(self, columns: list[Array], rows: int) -> tuple[Array, Array, Array]:
+        """u, y, kkt from the beginning, with exact line searches."""
+        y = qp_chain.settled(self.thorough, columns, np.zeros((rows, self.ending.size1_out(1))))
+        u, y, kkt = evaluate(self.ending, *columns, y)
+        return u, y, kkt
 
 
 @lru_cache(maxsize=32)
@@ -234,29 +226,9 @@ def _kit(m: int, n: int, compiled: bool) -> _Kit:
 
 
 def _make_kit(given: active_set.Given, compiled: bool) -> _Kit:
-    n = given[1].B.shape[1]
-    functions = {
-        "first": active_set.steps(given, count=2),
-        "more": active_set.steps(given, count=1, name="wls_step"),
-        "thorough": active_set.steps(given, count=3 if n <= WIDE else 1, searches=8, name="wls_thorough"),
-        "ending": active_set.ending(given),
-    }
-    return _Kit(**{name: _Lazy(f, compiled) for name, f in functions.items()})
-
-
-class _Lazy:
-    """A function that is compiled when it is first called."""
-
-    def __init__(self, function: ca.Function, compiled: bool) -> None:
-        self.function, self.compiled = function, compiled
-        self.native: native.Native | None = None
-
-    def __call__(self, *arguments: Array) -> tuple[Array, ...]:
-        if not self.compiled:
-            return evaluate(self.function, *arguments)
-        if self.native is None:
-            self.native = native.compile(self.function, mode="fast")
-        return self.native(*arguments)
+    ending = active_set.ending(given)
+    chain = qp_chain.make(active_set.steps(given, count=1, name="wls_step"), ending, compiled=compiled)
+    return _Kit(chain, active_set.steps(given, count=1, searches=8, name="wls_thorough"), ending)
 
 
 def _columns(*values: Array) -> list[Array]:
@@ -279,32 +251,3 @@ def _columns(*values: Array) -> list[Array]:
     if (data[2] > data[3]).any():
         raise ModelError("solve_many: a lower limit is above its upper limit; correct the limits")
     return [np.ascontiguousarray(np.swapaxes(B, -1, -2)).reshape(*B.shape[:-2], m * n), *data[1:]]
-
-
-def _pick(columns: Sequence[Array], rows: np.ndarray) -> list[Array]:
-    return [c[rows] if c.ndim == 2 else c for c in columns]
-
-
-def _steps(kit: _Kit, columns: Sequence[Array], y: Array, *, thorough: bool = False) -> Array:
-    """Steps until no effector changes on the full step, fewer and fewer problems in each round."""
-    y = y.copy()
-    rows = np.arange(len(y))
-    for round_ in range(ROUNDS):
-        function = kit.thorough if thorough or round_ > 2 else kit.first if round_ == 0 else kit.more
-        whole = rows.size == len(y)
-        y[rows], settled = function(*(columns if whole else _pick(columns, rows)), y if whole else y[rows])
-        rows = rows[settled[:, 0] == 0]
-        if not rows.size:
-            break
-    return y
-
-
-def _start(kit: _Kit, columns: Sequence[Array], N: int, m: int) -> Array:
-    """Prices to begin with: those of every 12th problem, and between them the straight line."""
-    if N <= FEW:
-        return _steps(kit, columns, np.zeros((N, m)))
-    knots = np.append(np.arange(0, N - 1, STRIDE), N - 1)
-    prices = _steps(kit, _pick(columns, knots), np.zeros((len(knots), m)))
-    at = np.minimum(np.arange(N) // STRIDE, len(knots) - 2)
-    part: Any = ((np.arange(N) - knots[at]) / np.diff(knots)[at])[:, None]
-    return prices[at] * (1 - part) + prices[at + 1] * part

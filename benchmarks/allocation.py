@@ -285,31 +285,34 @@ def run(n: int, *, demands: int = DEMANDS, budget: float = BUDGET, repeat: int =
     return rows
 
 
-def shown(row: Row, best: float) -> tuple[str, ...]:
-    if row.note:
-        return (str(row.effectors), row.tool, "-", "-", "-", "-", row.note)
-    return (
-        str(row.effectors), row.tool, f"{row.microseconds:.3g}", f"{row.microseconds / best:.3g}", f"{row.kkt:.1e}", f"{row.distance:.1e}",
-        str(row.answered),
-    )  # fmt: skip
-
-
-def main() -> None:
-    given = _bench.options(__doc__).parse_args()
-    found: list[Row] = []
+def measure(*, quick: bool = False) -> dict[str, Any]:
+    """Rows of all tools on all problems."""
+    rows: list[Row] = []
     for n in (3, 10, 44):
-        found += run(n, demands=1000, budget=0.3, repeat=1) if given.quick else run(n)
-    if given.json:
-        plain: list[dict[str, Any]] = [{k: (None if v != v else v) for k, v in asdict(row).items()} for row in found]
-        _bench.write_json({"machine": _bench.machine(), "rows": plain})
-        return
-    rows = [shown(row, found[0 if row.effectors == 3 else 10 if row.effectors == 10 else 20].microseconds) for row in found]
+        rows += run(n, demands=1000, budget=0.3, repeat=1) if quick else run(n)
+    return {"machine": _bench.machine(), "rows": [{k: None if v != v else v for k, v in asdict(row).items()} for row in rows]}
+
+
+def show(result: dict[str, Any]) -> None:
+    """The table."""
+    rows, least = result["rows"], {}
+    for row in rows:
+        least.setdefault(row["effectors"], row["microseconds"])  # the first is the own solver
     _bench.table(
         "Bounded least squares, demands that follow each other",
         ("effectors", "tool", "us/solve", "times own", "KKT", "distance", "answered"),
-        rows, note="KKT and distance: the worst of all answers, judged here; times own: beside the first row of the same problem",
+        [shown(row, least[row["effectors"]]) for row in rows],
+        note="KKT and distance: the worst of all answers, judged here; times own: beside the first row of the same problem",
     )  # fmt: skip
 
 
+def shown(row: dict[str, Any], least: float) -> tuple[str, ...]:
+    """A line of the table."""
+    n, tool, each = str(row["effectors"]), row["tool"], row["microseconds"]
+    if row["note"]:
+        return (n, tool, "-", "-", "-", "-", row["note"])
+    return (n, tool, f"{each:.3g}", f"{each / least:.3g}", f"{row['kkt']:.1e}", f"{row['distance']:.1e}", str(row["answered"]))
+
+
 if __name__ == "__main__":
-    main()
+    _bench.run(__doc__, measure, show)

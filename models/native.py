@@ -6,10 +6,11 @@ import ctypes
 import itertools
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Literal, get_args
 
 import casadi as ca
@@ -28,6 +29,7 @@ Backend = Literal["lanes", "c", "interpreter"]
 LANES = (1, 2, 4, 8, 16)
 BEST_LANES = {"x86-64-v4": 8, "x86-64-v3": 8}  # measured on flights; 2 elsewhere
 WORTH_A_THREAD = 64  # vectors of cases; below, starting a thread costs more than it saves
+_MOST_PARTS = 256  # threads that one process may start for batches
 _MOST_THREADS: ContextVar[int | None] = ContextVar("most_threads", default=None)  # inside shared_by
 
 _DRIVER = """
@@ -244,7 +246,7 @@ def options(function: ca.Function, lanes: int | str, threads: int | str, mode: s
     for i in range(function.n_in()):
         if function.size2_in(i) > 1:
             raise ModelError(f"{name}: {function.name_in(i)}: is a matrix {function.size_in(i)}; declare a vector")
-    return _processors() if threads == "auto" else int(threads)
+    return processors() if threads == "auto" else int(threads)
 
 
 def native_available() -> bool:
@@ -276,7 +278,7 @@ def shared_by(tasks: int) -> Iterator[None]:
     """
     if tasks < 1:
         raise ModelError(f"native: tasks that share the processors: expected an integer >= 1, got {tasks}; count this one too")
-    before = _MOST_THREADS.set(max(1, _processors() // tasks))
+    before = _MOST_THREADS.set(max(1, processors() // tasks))
     try:
         yield
     finally:
@@ -288,12 +290,23 @@ def in_threads(run: Callable[[int, int], None], rows: int, lanes: int, threads: 
     vectors, most = -(-rows // lanes), _MOST_THREADS.get()
     parts = max(1, min(threads, vectors // vectors_each, threads if most is None else most))
     edges = [min(rows, lanes * (vectors * k // parts)) for k in range(parts)] + [rows]
-    if parts == 1:
-        run(0, rows)
-        return
-    with ThreadPoolExecutor(parts) as pool:
-        for done in [pool.submit(run, first, last) for first, last in itertools.pairwise(edges)]:
-            done.result()
+    others = [_pool().submit(run, first, last) for first, last in itertools.pairwise(edges[1:])]
+    try:
+        run(0, edges[1])
+    finally:
+        wait(others)  # whatever happens: they write into arrays of the caller
+    for other in others:
+        other.result()
+
+
+@lru_cache(maxsize=1)
+def _pool() -> ThreadPoolExecutor:
+    """Threads that stay: starting two takes longer than many a batch."""
+    return ThreadPoolExecutor(_MOST_PARTS, thread_name_prefix="reentry")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not outlive a fork
 
 
 def address(array: np.ndarray) -> ctypes.c_void_p:
@@ -311,7 +324,8 @@ def strides(arrays: Sequence[np.ndarray]) -> Any:
     return (ctypes.c_longlong * (len(arrays) + 1))(*[a.shape[1] if a.ndim == 2 else 0 for a in arrays], 0)
 
 
-def _processors() -> int:
+def processors() -> int:
+    """Processors that this process may use."""
     try:
         return max(1, len(os.sched_getaffinity(0)))
     except AttributeError:

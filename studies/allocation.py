@@ -11,7 +11,7 @@ import numpy as np
 from allocation import attainable, backends, blending, methods
 from allocation.compare import COLUMNS, Comparison, History, Method, compare
 from allocation.core import Effectors
-from models.checked import Array, ModelError, evaluate, unknown_name
+from models.checked import ModelError, evaluate, unknown_name
 from models.shuttle_aero import orbiter_aero, orbiter_data
 from models.thrusters import ThrusterSet, elevons_and_flap, orbiter_jets
 from models.units import DEG
@@ -58,7 +58,7 @@ def pitch_history(flight: Flight, *, handover: blending.Handover | None = None, 
     qbar, trim, slope, demand = (flight[name][rows] for name in ("qbar", "trim", "slope", "demand"))
     jets = flight.loop.jets
     up, down = (float(m) for m in jets.moments())
-    low, high = _limits(h)(qbar[:, None], trim[:, None])
+    low, high = blending.limits_arrays(qbar, trim, handover=h)
     open_ = (qbar <= h.q2).astype(float) if h.rcs_inhibit_above_q2 else np.ones(len(rows))
     B = np.stack([slope, np.full_like(slope, up), np.full_like(slope, down)], axis=1)[:, None, :]
     effectors = Effectors(
@@ -71,19 +71,6 @@ def pitch_history(flight: Flight, *, handover: blending.Handover | None = None, 
         context={"demand_rad": demand, "qbar": qbar, "trim": trim}, axis_weight=np.ones((len(rows), 1)),
         effector_weight=np.abs(B[:, 0]) * np.array([COST_ELEVON, COST_JETS, COST_JETS]), name="pitch",
     )  # fmt: skip
-
-
-def _limits(handover: blending.Handover) -> Callable[[Array, Array], tuple[Array, Array]]:
-    import casadi as ca
-
-    q, trim = ca.SX.sym("qbar"), ca.SX.sym("trim")
-    function = ca.Function("elevon_limits", [q, trim], list(blending.limits(q, trim, handover=handover)), ["qbar", "trim"], ["low", "high"])
-
-    def call(qbar: Array, at: Array) -> tuple[Array, Array]:
-        low, high = evaluate(function, qbar, at)
-        return low[:, 0], high[:, 0]
-
-    return call
 
 
 def orbiter_effectors(condition: Condition | None = None, *, jets: ThrusterSet | None = None) -> Effectors:

@@ -244,7 +244,7 @@ def test_bits_do_not_depend_on_batch_or_threads(mode):
 
 
 def test_tasks_that_share_the_processors_take_their_part(monkeypatch):
-    monkeypatch.setattr(native, "_processors", lambda: 6)
+    monkeypatch.setattr(native, "processors", lambda: 6)
 
     def parts(threads=6, rows=1000):
         seen = []

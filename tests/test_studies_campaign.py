@@ -119,7 +119,7 @@ def test_compiled_flights_give_the_same_bytes_for_any_lanes_and_threads(tmp_path
     for lanes in (4, 8):
         for threads in (1, 2):
             monkeypatch.setattr(native, "BEST_LANES", {native.cpu_target(): lanes})
-            monkeypatch.setattr(native, "_processors", lambda threads=threads: threads)
+            monkeypatch.setattr(native, "processors", lambda threads=threads: threads)
             native_flight._compiled.cache_clear()
             found.add(digest(campaign.run(small(chunk=7), tmp_path / f"{lanes}-{threads}")))
     native_flight._compiled.cache_clear()

@@ -68,19 +68,21 @@ def compiled_by_this_worker(folder: str, text: str, drawn: Any, native: Any, cod
     from models import native as compiled
 
     if not hasattr(compiled, "counted"):
-        in_threads, pool = compiled.in_threads, compiled.ThreadPoolExecutor
+        in_threads = compiled.in_threads
         parts: list[int] = []
 
         def counted(run: Any, rows: int, lanes: int, threads: int, *, vectors_each: int = 1) -> None:
-            parts.append(1)
-            in_threads(run, rows, 1, 8, vectors_each=1)  # as many as are allowed
+            ran: list[int] = []
 
-        def counted_pool(threads: int) -> Any:
-            parts.append(threads)
-            return pool(threads)
+            def part(first: int, last: int) -> None:
+                ran.append(first)
+                run(first, last)
+
+            in_threads(part, rows, 1, 8, vectors_each=1)  # as many as are allowed
+            parts.append(len(ran))
 
         setattr(compiled, "counted", parts)  # noqa: B010 (kept between the chunks of one worker)
-        compiled.in_threads, compiled.ThreadPoolExecutor, compiled._processors = counted, counted_pool, lambda: 8
+        compiled.in_threads, compiled.processors = counted, lambda: 8
     flown = fly_remote(text, drawn, native, code, tasks)
     (Path(folder) / f"{os.getpid()}").write_text(f"{tasks} {max(compiled.counted)}")
     return flown
