@@ -260,10 +260,21 @@ COLUMNS = ("method", "rms error", "worst error", "propellant kg", "pulses", "tra
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """Outcomes of several methods on one history; shows itself as a table in a notebook."""
+    """Outcomes of several methods on one history; shows itself as a table in a notebook.
+
+    Attributes
+    ----------
+    history : History
+    outcomes : tuple of Outcome
+        Each on the samples that the method was asked for.
+    same : tuple of Outcome
+        All on the samples of the method that was asked for the fewest, as a history of their own: these errors and propellants compare.
+        The same as `outcomes` if every method got every sample.
+    """
 
     history: History
     outcomes: tuple[Outcome, ...]
+    same: tuple[Outcome, ...]
 
     def __repr__(self) -> str:
         return f"Comparison({', '.join(o.name for o in self.outcomes)}; {self.history!r})"
@@ -274,21 +285,28 @@ class Comparison:
                 return outcome
         raise ModelError(f"comparison: no method {name!r}; known: {', '.join(o.name for o in self.outcomes)}")
 
-    def rows(self) -> list[tuple[str | float, ...]]:
-        """One row for each method, in the order of :data:`COLUMNS`; "–" where a method has no such number."""
+    def rows(self, *, same: bool = False) -> list[tuple[str | float, ...]]:
+        """One row for each method, in the order of :data:`COLUMNS`; "–" where a method has no such number.
+
+        Parameters
+        ----------
+        same : bool
+            Of the outcomes on the same samples.
+        """
 
         def shown(value: float | None) -> str | float:
             return "–" if value is None or value != value else value
 
         return [
             (o.name, o.rms, o.worst, o.propellant, shown(o.pulses), shown(None if o.travel is None else float(np.degrees(o.travel))),
-             shown(o.worst_kkt), o.unsolved, o.microseconds, len(o.samples)) for o in self.outcomes
+             shown(o.worst_kkt), o.unsolved, o.microseconds, len(o.samples)) for o in (self.same if same else self.outcomes)
         ]  # fmt: skip
 
     def _repr_html_(self) -> str:
         from models.drawing import html_table
 
-        return html_table(COLUMNS, self.rows())
+        text = html_table(COLUMNS, self.rows())
+        return text if self.same == self.outcomes else text + html_table(COLUMNS, self.rows(same=True))
 
     def plot(self, methods: Sequence[str] | None = None) -> Figure:
         """Demand and residual on each axis for some of the methods (all that answered every sample)."""
@@ -327,13 +345,16 @@ def compare(history: History, methods: Sequence[Method]) -> Comparison:
     names = [method.name for method in methods]
     if not names or len(set(names)) != len(names):
         raise ModelError(f"compare: expected methods of different names, got {names}")
-    return Comparison(history, tuple(_outcome(history, method) for method in methods))
+    outcomes = tuple(_outcome(history, method, method.most) for method in methods)
+    fewest = min(outcomes, key=lambda o: len(o.samples)).samples
+    same = tuple(o if len(o.samples) == len(fewest) else _outcome(history, m, len(fewest)) for o, m in zip(outcomes, methods, strict=True))
+    return Comparison(history, outcomes, same)
 
 
-def _outcome(history: History, method: Method) -> Outcome:
+def _outcome(history: History, method: Method, most: int) -> Outcome:
     N = len(history)
-    every = method.most == 0 or method.most >= N
-    rows = np.arange(N) if every else _some(history, method.most)
+    every = most == 0 or most >= N
+    rows = np.arange(N) if every else _some(history, most)
     asked = history if every else history.part(rows)
     found = method.answer(asked)
     wrench = np.einsum("kn,mn->km", found.u, asked.effectors.B) if asked.B is None else np.einsum("kn,kmn->km", found.u, asked.B)

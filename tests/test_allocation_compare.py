@@ -90,6 +90,23 @@ def test_slow_methods_get_a_part():
     assert limited.samples.tolist() == [4, 5]  # in one piece, around the largest demand
 
 
+@pytest.mark.parametrize("rate", [[np.inf] * 3, [0.2, np.inf, np.inf]])
+def test_all_methods_on_the_same_samples(rate):
+    history = pitch(rate=rate)
+    both = compare.compare(history, [user_method("all", elevon_first), user_method("few", elevon_first, most=3)])
+    whole, few = both.outcomes
+    assert (len(whole.samples), len(few.samples)) == (6, 3)
+    assert [o.name for o in both.same] == ["all", "few"]
+    assert both.same[1] is few
+    assert both.same[0].samples.tolist() == few.samples.tolist()
+    assert np.array_equal(both.same[0].u, few.u)  # as a history of their own, which begins at rest
+    assert both.rows(same=True)[0][1:4] == both.rows(same=True)[1][1:4]
+    assert both._repr_html_().count("<table") == 2
+    alone = compare.compare(history, [user_method("all", elevon_first)])
+    assert alone.same == alone.outcomes
+    assert alone._repr_html_().count("<table") == 1
+
+
 def test_effectiveness_may_change_with_time():
     e = pitch().effectors
     B = np.array([[[-2.0 - k, 1.0, -1.0]] for k in range(6)])
