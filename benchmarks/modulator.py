@@ -241,12 +241,8 @@ def measure(*, quick: bool = False) -> dict[str, Any]:
     return {"machine": _bench.machine(), "rows": rows, "map": maps, "cycle": cycle_rows(quick=quick)}
 
 
-def main() -> None:
-    options = _bench.options(__doc__).parse_args()
-    result = measure(quick=options.quick)
-    if options.json:
-        _bench.write_json(result)
-        return
+def show(result: dict[str, Any]) -> None:
+    """The tables."""
     ours = result["rows"][0]["seconds"]
     lines = []
     for row in result["rows"]:
@@ -271,4 +267,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    _bench.run(__doc__, measure, show)

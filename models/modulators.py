@@ -15,7 +15,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from models.checked import Array, ModelError, as_finite
-from models.modulators_base import NUMPY, Modulator, Ops, Values, checked_fields, dead_zone, require_positive, require_thresholds, schmitt
+from models.modulators_base import (
+    NUMPY,
+    DigitalFilter,
+    Filtered,
+    Modulator,
+    Ops,
+    Values,
+    checked_fields,
+    dead_zone,
+    require_positive,
+    require_thresholds,
+    schmitt,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +69,7 @@ def dead_band_relay(u_on: float) -> SchmittTrigger:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DiscretePWPF(Modulator):
+class DiscretePWPF(DigitalFilter):
     """Sampled PWPF modulator with feedback gain and asymmetric dead zone.
 
     x_k = n x_{k-1} + m (e_k + e_{k-1}),  e_k = f(r_k) - k y_{k-1},  y_k = Schmitt(x_k; y_{k-1}).
@@ -99,21 +111,6 @@ class DiscretePWPF(Modulator):
         require_positive(self, ("km", "tau_m", "Ts"))
         require_thresholds(self.NAME, self.u_on, self.u_off)
 
-    @property
-    def m(self) -> float:
-        """Gain of the digital filter, km Ts/(2 tau_m + Ts) (eq 3; 12/23 for the paper's values, where its eq 11 prints 0.5237)."""
-        return self.km * self.Ts / (2 * self.tau_m + self.Ts)
-
-    @property
-    def n(self) -> float:
-        """Pole of the digital filter, (2 tau_m - Ts)/(2 tau_m + Ts), between -1 and 1 (eq 3)."""
-        return (2 * self.tau_m - self.Ts) / (2 * self.tau_m + self.Ts)
-
-    @property
-    def u_off(self) -> float:
-        """Off threshold u_on - h."""
-        return self.u_on - self.h
-
     def f(self, r: ArrayLike) -> Array:
         """Asymmetric dead zone f(r) = delta + r - min(max(r, -dead_low), dead_high), f(0) = delta; shape of r."""
         return np.asarray(dead_zone(NUMPY, as_finite("pwpf: r", r), self.delta, self.dead_low, self.dead_high))
@@ -129,7 +126,7 @@ class DiscretePWPF(Modulator):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ContinuousPWPF(Modulator):
+class ContinuousPWPF(Filtered):
     """PWPF modulator with a continuous filter; exact between switches for a demand held over Ts.
 
     tau_m dx/dt = -x + km (r - y),  y = Schmitt(x).  Under a constant demand the orbit leaves its first state by at most two switches and
@@ -165,11 +162,6 @@ class ContinuousPWPF(Modulator):
         if self.h <= 0:
             raise ModelError(f"cpwpf: h = {self.h:.6g}; expected > 0: without hysteresis the output switches infinitely often")
         require_thresholds(self.NAME, self.u_on, self.u_off)
-
-    @property
-    def u_off(self) -> float:
-        """Off threshold u_on - h."""
-        return self.u_on - self.h
 
     @staticmethod
     def advance(ops: Ops, z: Values, r: Any, p: Values) -> tuple[Values, Any]:
@@ -219,7 +211,7 @@ ENDLESS = 1e300  # a time that no sample reaches; infinity would give NaN in bra
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PseudoRate(Modulator):
+class PseudoRate(DigitalFilter):
     """Sampled pseudo-rate modulator: Schmitt trigger with a first-order lag in its feedback.
 
     x_k = n x_{k-1} + m (y_{k-1} + y_{k-2}),  y_k = Schmitt(r_k - x_k; y_{k-1}); m, n as in :class:`DiscretePWPF`.
@@ -250,21 +242,6 @@ class PseudoRate(Modulator):
         checked_fields(self, h=0.0)
         require_positive(self, ("km", "tau_m", "Ts"))
         require_thresholds(self.NAME, self.u_on, self.u_off)
-
-    @property
-    def m(self) -> float:
-        """km Ts/(2 tau_m + Ts)."""
-        return self.km * self.Ts / (2 * self.tau_m + self.Ts)
-
-    @property
-    def n(self) -> float:
-        """(2 tau_m - Ts)/(2 tau_m + Ts)."""
-        return (2 * self.tau_m - self.Ts) / (2 * self.tau_m + self.Ts)
-
-    @property
-    def u_off(self) -> float:
-        """Off threshold u_on - h."""
-        return self.u_on - self.h
 
     @staticmethod
     def advance(ops: Ops, z: Values, r: Any, p: Values) -> tuple[Values, Any]:

@@ -105,6 +105,41 @@ class Modulator:
         return ca.Function(f"{cls.NAME}_kernel", [z, r, p], [ca.vertcat(*after), y], ["z", "r", "p"], ["z_next", "y"])
 
 
+class Filtered(Modulator):
+    """A first-order filter and a Schmitt trigger with the hysteresis h."""
+
+    __slots__ = ()
+    km: float
+    tau_m: float
+    u_on: float
+    h: float
+    Ts: float
+
+    @property
+    def u_off(self) -> float:
+        """Off threshold u_on - h."""
+        return self.u_on - self.h
+
+
+class DigitalFilter(Filtered):
+    """The filter km/(tau_m s + 1) by the trapezoidal rule: x_k = n x_{k-1} + m (e_k + e_{k-1}).
+
+    Source: Lu & Zhang 2012 (paper 000), eq 3.
+    """
+
+    __slots__ = ()
+
+    @property
+    def m(self) -> float:
+        """Gain, km Ts/(2 tau_m + Ts) (12/23 for the values of paper 000, where its eq 11 prints 0.5237)."""
+        return self.km * self.Ts / (2 * self.tau_m + self.Ts)
+
+    @property
+    def n(self) -> float:
+        """Pole, (2 tau_m - Ts)/(2 tau_m + Ts), between -1 and 1."""
+        return (2 * self.tau_m - self.Ts) / (2 * self.tau_m + self.Ts)
+
+
 def schmitt(ops: Ops, x: Any, y: Any, u_on: Any, u_off: Any) -> Any:
     """Output of the Schmitt trigger for input x and the output y before it.
 

@@ -90,6 +90,11 @@ class Engine:
             )
         return np.column_stack([start, end - start, signals])
 
+    def memory(self, c: Array) -> Array:
+        """Memory of the law in carries (..., nc), shape (..., nz)."""
+        nx = len(self.model.states)
+        return c[..., nx : nx + len(self.bound.z0)]
+
     def split(self, c: Array) -> tuple[Array, Array]:
         """States and inputs of carries (..., nc)."""
         nx, nu = len(self.model.states), len(self.model.inputs)

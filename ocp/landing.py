@@ -15,7 +15,7 @@ from models.native import Mode
 from ocp import flight
 from ocp.laws import Law
 from ocp.methods import RK4
-from ocp.native_flight import fly_native
+from ocp.simulate import simulate_ensemble
 from ocp.stops import falls_below
 
 
@@ -190,27 +190,15 @@ def fly(
     ModelError
         Wrong shapes, or numbers outside ``Var.valid``.
     """
-    plant, until = guidance.plant, falls_below("h", altitude)
+    plant = guidance.plant
     starts = np.atleast_2d(as_batch("x0", x0, plant.states))
     params = np.atleast_2d(as_batch("p", p, plant.params))
     if len(starts) != len(params) or len(starts) == 0:
         raise ModelError(f"fly: {len(starts)} rows of x0 beside {len(params)} of p; give equal numbers, at least one")
     if native not in ("off", "accurate", "fast"):
         raise ModelError(f"fly: native: expected 'off', 'accurate' or 'fast', got {native!r}")
-    engine = flight.prepare(plant, guidance.law.bind(plant), RK4(step=step), t_max, until)
-    blocks = []
-    for first in range(0, len(starts), flight.BLOCK):
-        rows = slice(first, first + flight.BLOCK)
-        if native == "off":
-            outcome, _ = flight.fly_to_stop(engine, starts[rows], params[rows])
-        else:
-            outcome = fly_native(engine, starts[rows], params[rows], native)
-        blocks.append(outcome)
-        if progress is not None:
-            progress(min(1.0, (first + flight.BLOCK) / len(starts)))
-    c = np.concatenate([b.c for b in blocks])
-    nx, nz = len(plant.states), len(guidance.memory)
-    return Landings(
-        frozen(np.concatenate([b.t for b in blocks])), frozen(c[:, :nx]), frozen(c[:, nx : nx + nz]),
-        frozen(guidance.target.miss(c[:, :3])), tuple(flight.STATUSES[s] for b in blocks for s in b.status), guidance,
+    flown = simulate_ensemble(
+        plant, guidance.law, x0=starts, p=params, until=falls_below("h", altitude), t_max=t_max, method=RK4(step=step),
+        progress=progress, native=native, block=flight.BLOCK,
     )  # fmt: skip
+    return Landings(flown.t, flown.x, flown.z, frozen(guidance.target.miss(flown.x[:, :3])), flown.status, guidance)

@@ -111,6 +111,8 @@ class Ensemble:
         Stop times, s (of the last good state for a failed case).
     x : ndarray, shape (N, nx)
         States there.
+    z : ndarray, shape (N, nz)
+        Memory of the law after its last call; nz = 0 for a law without one.
     status : tuple of Status, length N
     ok : ndarray of bool, shape (N,)
         Mask of the cases that met their stop condition.
@@ -123,6 +125,7 @@ class Ensemble:
 
     t: Array
     x: Array
+    z: Array
     status: tuple[Status, ...]
     ok: np.ndarray
     model: Model
@@ -152,6 +155,7 @@ def simulate_ensemble(
     progress: Callable[[float], None] | None = None,
     samples: bool = False,
     native: Native = "auto",
+    block: int | None = None,
 ) -> Ensemble:
     """Fly N cases at once; a case that fails carries its reason and the others stand.
 
@@ -172,6 +176,9 @@ def simulate_ensemble(
     native : {"auto", "off", "accurate", "fast"}
         Compiled code in SIMD lanes on all cores: "accurate" gives the interpreter's numbers to 1e-12, "fast" to 1e-9.  "auto" is
         "accurate" from 2000 cases on, where compiling pays.  Not for samples or the Adaptive method.
+    block : int, optional
+        Cases flown together: the interpreter's memory grows with it, and compiled code reports progress after each block.  4096 in
+        the interpreter and 131072 in compiled code unless given; give less for a law whose calls take long.
 
     Returns
     -------
@@ -188,12 +195,16 @@ def simulate_ensemble(
         raise ModelError(f"simulate_ensemble: {len(starts)} rows of x0 beside {len(params)} of p; give equal numbers, or one row")
     starts, params = (a if len(a) == cases else np.repeat(a, cases, axis=0) for a in (starts, params))
     mode = _mode(native, cases, samples=samples, adaptive=isinstance(method, Adaptive))
+    if block is None:
+        block = flight.BLOCK if mode is None else NATIVE_BLOCK
+    if block < 1:
+        raise ModelError(f"simulate_ensemble: block: expected at least one case, got {block}")
     engine = flight.prepare(model, law.bind(model), method, end, until, alone=not samples and not isinstance(method, Adaptive))
-    t, x, status = np.zeros(cases), starts.copy(), np.full(cases, flight.CODE[Status.OUT_OF_DOMAIN])
+    t, x, z = np.zeros(cases), starts.copy(), np.repeat(engine.bound.z0[None], cases, axis=0)
+    status = np.full(cases, flight.CODE[Status.OUT_OF_DOMAIN])
     kept: list[flight.Record] = []
     outside = ~(_inside(starts, model.states) & _inside(params, model.params))
     inside = np.flatnonzero(~outside)
-    block = flight.BLOCK if mode is None else NATIVE_BLOCK
     for first in range(0, len(inside), block):
         rows = inside[first : first + block]
         # views where all cases fly: copies cost a tenth of the compiled flights
@@ -205,12 +216,13 @@ def simulate_ensemble(
         else:
             outcome = fly_native(engine, starts[place], params[place], mode, progress=report)
         kept += [(rows[case], times, states, inputs) for case, times, states, inputs in chunks or ()]
-        t[place], x[place], status[place] = outcome.t, engine.split(outcome.c)[0], outcome.status
+        t[place], x[place], z[place] = outcome.t, engine.split(outcome.c)[0], engine.memory(outcome.c)
+        status[place] = outcome.status
     taken = Samples(*(np.concatenate(parts) for parts in zip(*kept, strict=True))) if kept else None
     refused = np.flatnonzero(outside)
     details = {int(i): _outside(starts[i], model.states) or _outside(params[i], model.params) for i in refused}
     words, ok = tuple(map(flight.STATUSES.__getitem__, status.tolist())), status == flight.CODE[Status.OK]
-    return Ensemble(frozen(t), frozen(x), words, ok, model, taken, details)
+    return Ensemble(frozen(t), frozen(x), frozen(z), words, ok, model, taken, details)
 
 
 def _mode(native: Native, cases: int, *, samples: bool, adaptive: bool) -> Mode | None:

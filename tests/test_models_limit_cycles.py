@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from conftest import random_loops
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, fsolve
 
@@ -23,12 +24,6 @@ from models.modulators import SchmittTrigger
 
 PAPER = SchmittTrigger(0.7, 0.3)
 A, TAU = 0.15, 0.7
-
-
-def random_loops(count, seed):
-    rng = np.random.default_rng(seed)
-    a, u_on, tau = (10 ** rng.uniform(low, high, count) for low, high in ((-4, 1), (-2, 1), (-1.5, 1.5)))
-    return np.column_stack([a, u_on, u_on * rng.uniform(0, 1, count), tau])
 
 
 # --- closed forms -------------------------------------------------------------------------------------------------

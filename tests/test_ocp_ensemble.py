@@ -136,6 +136,7 @@ def test_an_output_without_a_value_at_the_start():
         ({"p": {"mass": 1.0}}, "p: expected real numbers"),
         ({"until": None}, "give a stop condition"),
         ({"t_max": -1.0}, "t_max must be finite and > 0"),
+        ({"block": 0}, "block: expected at least one case, got 0"),
     ],
 )
 def test_bad_calls(arguments, text):
@@ -242,6 +243,25 @@ UNTIL = {
     "output": ocp.falls_below("mach", 12.0),
     "either": ocp.first_of(ocp.falls_below("h", 30e3), ocp.rises_above("load", 2.5)),
 }
+
+
+@pytest.mark.parametrize("native", ["off", pytest.param("accurate", marks=NEEDS_COMPILER)])
+def test_the_memory_of_the_law_at_the_end(native):
+    """A law that counts its calls and adds their times, in blocks of three cases; h falls from 1 to 0.25 at a rate of its own."""
+    rate = Var("rate", valid=(0.1, 9.0))
+    model = define("fall", lambda x, u, p: {"h": -p.rate * u.a}, states=[Var("h", "m", 1.0)], inputs=[Var("a")], params={rate: 1.0})
+    law = ocp.sampled(lambda t, x, y, z, w: (1, z + ca.vertcat(1, t)), sample=0.1, memory=[5.0, 7.0])
+    rates = np.array([0.52, 0.8, 1.3, 20.0, 2.1, 3.3, 0.61])
+    seen = []
+    flown = ocp.simulate_ensemble(
+        model, law, x0=[1.0], p=rates[:, None], until=ocp.falls_below("h", 0.25), t_max=5.0, native=native, block=3, progress=seen.append
+    )  # fmt: skip
+    calls = np.where(rates < 9, np.ceil(0.75 / rates / 0.1), 0)
+    assert flown.ok.tolist() == (rates < 9).tolist()
+    assert flown.z == pytest.approx(np.column_stack([5 + calls, 7 + 0.05 * calls * (calls - 1)]), rel=1e-12)
+    assert seen == pytest.approx([0.5, 1.0])  # of six cases: one is outside the range of its rate
+    for without in (ocp.constant(a=1.0), ocp.sampled(lambda t, x, y, z, w: (1, z), sample=0.1)):
+        assert ocp.simulate_ensemble(model, without, x0=[[1.0], [2.0]], t_max=0.1).z.shape == (2, 0)
 
 
 @NEEDS_COMPILER

@@ -8,32 +8,24 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from conftest import Run
 
-from studies import campaign, campaign_workers, cli
+from studies import campaign, campaign_workers
 from studies.scenario import Scenario
 
 ROOT = Path(__file__).resolve().parent.parent
-Run = Callable[..., tuple[int, str, str]]
 SMALL = ("--cases", 12, "--set", "campaign.chunk=5")
 
 
 @pytest.fixture
-def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments: object) -> tuple[int, str, str]:
-        capsys.readouterr()
-        code = cli.main(["campaign", *map(str, arguments)])
-        taken = capsys.readouterr()
-        return code, taken.out, taken.err
-
-    return call
+def run(run: Run) -> Run:
+    return partial(run, "campaign")
 
 
 def test_run_show_and_replay(run: Run, tmp_path: Path) -> None:

@@ -9,20 +9,19 @@ import signal
 import subprocess
 import sys
 import types
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
+from conftest import Run
 from matplotlib.figure import Figure
 
 from models.checked import ModelError
-from studies import cli, console, doctor
+from studies import console, doctor
 from studies.scenario import Scenario
 
 ROOT = Path(__file__).resolve().parent.parent
-Outcome = tuple[int, str, str]
-Run = Callable[..., Outcome]
 
 
 class FakeStudy:
@@ -44,19 +43,6 @@ class FakeStudy:
 
     def summary(self) -> list[tuple[str, float, str]]:
         return [("flight time [bold]", self.value, "s")]
-
-
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments: object) -> Outcome:
-        capsys.readouterr()
-        code = cli.main([str(a) for a in arguments])
-        taken = capsys.readouterr()
-        return code, taken.out, taken.err
-
-    return call
 
 
 @pytest.fixture

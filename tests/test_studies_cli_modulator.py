@@ -5,30 +5,20 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-
-from studies import cli
+from conftest import Run
 
 ROOT = Path(__file__).resolve().parent.parent
-Run = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture
-def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments: object) -> tuple[int, str, str]:
-        capsys.readouterr()
-        code = cli.main(["modulator", *map(str, arguments)])
-        taken = capsys.readouterr()
-        return code, taken.out, taken.err
-
-    return call
+def run(run: Run) -> Run:
+    return partial(run, "modulator")
 
 
 def answer(run: Run, *arguments: object) -> tuple[dict[str, Any], str]:

@@ -4,31 +4,22 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import Run
 
 from models.flexible_loop import FLEXIBLE_001, Mode
 from models.modulators import SchmittTrigger
 from ocp.jet_design import JetLimits
-from studies import cli, jetloop
-
-Run = Callable[..., tuple[int, str, str]]
+from studies import jetloop
 
 
 @pytest.fixture
-def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments: object) -> tuple[int, str, str]:
-        capsys.readouterr()
-        code = cli.main(["jetloop", *map(str, arguments)])
-        taken = capsys.readouterr()
-        return code, taken.out, taken.err
-
-    return call
+def run(run: Run) -> Run:
+    return partial(run, "jetloop")
 
 
 @pytest.fixture(scope="module")
