@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -51,7 +50,7 @@ def result(study: BlendStudy) -> StudyResult:
 
 def figures(study: BlendStudy) -> list[FigureItem]:
     """All figures of the study."""
-    makers: list[tuple[str, str, str, Callable[[BlendStudy], Any]]] = [
+    makers: list[fig.Maker[BlendStudy]] = [
         (
             "blend_flight", "The flight, as in figure 11 of the paper",
             "(a) to (h) as in the paper's figure 11, then propellant and pulses. Broken lines: the command, and q1 and q2.", flight_figure,
@@ -74,11 +73,7 @@ def figures(study: BlendStudy) -> list[FigureItem]:
         makers.insert(2, (
             "blend_stress", "Stress cases", "A manoeuvre of 2 deg up or down inside the blending window.", stress_figure,
         ))  # fmt: skip
-    items = []
-    for name, title, caption, make in makers:
-        with fig.style():
-            items.append(FigureItem(name, title, caption, make(study)))
-    return items
+    return fig.items(makers, study)
 
 
 def flight_figure(study: BlendStudy) -> Any:

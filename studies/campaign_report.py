@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -133,7 +132,7 @@ def tables(campaign: Campaign) -> list[Table]:
 
 def figures(campaign: Campaign) -> list[FigureItem]:
     """Histogram and distribution, convergence, and miss against each dispersed quantity."""
-    makers: tuple[tuple[str, str, str, Callable[[Campaign], Figure]], ...] = (
+    makers: tuple[fig.Maker[Campaign], ...] = (
         (
             "distribution", "Range errors",
             "Left: number of cases by range error. Right: share of the cases with a smaller magnitude, with a band that holds the whole "
@@ -148,11 +147,7 @@ def figures(campaign: Campaign) -> list[FigureItem]:
             f"At most {DOTS} cases, evenly taken by number; the line joins the medians of twenty equal groups of all cases.", _scatter,
         ),
     )  # fmt: skip
-    items = []
-    for name, title, caption, make in makers:
-        with fig.style():
-            items.append(FigureItem(name, title, caption, make(campaign)))
-    return items
+    return fig.items(makers, campaign)
 
 
 def _distribution(campaign: Campaign) -> Figure:

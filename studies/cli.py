@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from studies import cli_allocate, cli_blend, cli_campaign, cli_jetloop, cli_landing, cli_modulator, console
+from studies.cli_options import AsJson, ShowScenario, out_folder, scenario_changes, scenario_file
 from studies.console import Code, InputError
 
 if TYPE_CHECKING:
@@ -38,16 +39,11 @@ app.add_typer(cli_allocate.app)
 app.command()(cli_blend.blend)
 app.command()(cli_landing.land)
 
-ScenarioFile = Annotated[
-    Path | None,
-    typer.Argument(metavar="SCENARIO.yaml", show_default=False, help="Scenario; keys left out keep their defaults (reference N1)."),
-]
-Changes = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", show_default=False, help="Change one key, such as vehicle.lift_to_drag=0.3; repeatable."),
-]
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
-OutFolder = Annotated[Path | None, typer.Option("--out", metavar="DIR", show_default=False, help="Write the results into this folder.")]
+_EXAMPLE = "vehicle.lift_to_drag=0.3"
+
+ScenarioFile = Annotated[Path | None, scenario_file("Scenario; keys left out keep their defaults (reference N1).")]
+Changes = Annotated[list[str] | None, scenario_changes(_EXAMPLE)]
+OutFolder = Annotated[Path | None, out_folder("Write the results into this folder.")]
 Cases = Annotated[int, typer.Option("--cases", min=1, max=100_000, help="Dispersed closed-loop flights in each set.")]
 Flights = Annotated[int, typer.Option("--dispersions", min=0, max=100_000, help="Dispersed closed-loop flights in each set.")]
 Times = Annotated[
@@ -55,7 +51,6 @@ Times = Annotated[
     typer.Option("--at", metavar="TIMES", show_default=False, help='Sample the gains at these times in s, such as "0,50,100".'),
 ]
 ReportFolder = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of the report; an older report there is replaced.")]
-ShowScenario = Annotated[bool, typer.Option("--print-scenario", help="Print the scenario with all its keys, ready to edit, and stop.")]
 
 _HEADLINES = (
     ("flight time", "t_f_s", "s"), ("range", "range_m", "m"), ("peak axial load", "peak_axial_g", "g0"),
@@ -228,27 +223,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _request(path: Path | None, changes: Sequence[str] | None, as_json: bool, out: Path | None, show: bool) -> Request:
-    from studies.files import check_folder
     from studies.scenario import Scenario
 
     scenario = Scenario.load(path) if path is not None else Scenario.default()
-    scenario = scenario.edit(dict(_change(text) for text in changes or ()), origin="--set")
+    scenario = scenario.edit(console.changes(changes, example=_EXAMPLE), origin="--set")
     for remark in scenario.remarks():
         console.say(f"note: {remark}")
-    if out is not None:
-        check_folder(out)
+    console.check_out(out)
     request = Request(scenario=scenario, as_json=as_json, out=out)
     if show:
-        console.print_text(console.to_json(scenario.to_dict()) if as_json else scenario.to_yaml().rstrip("\n"))
+        console.print_scenario(scenario, as_json=as_json)
         raise typer.Exit
     return request
-
-
-def _change(text: str) -> tuple[str, str]:
-    key, sign, value = text.partition("=")
-    if not sign or not key.strip():
-        raise InputError(f"--set: found {text!r}, expected key=value such as vehicle.lift_to_drag=0.3")
-    return key.strip(), value.strip()
 
 
 def _times(text: str | None) -> list[float] | None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from studies import console
+from studies.cli_options import AnswerFolder, AsJson
 from studies.console import InputError
 
 if TYPE_CHECKING:
@@ -63,17 +64,12 @@ def compare(
     ] = None,
     slow: Annotated[int, typer.Option("--slow", min=1, max=100_000, help="Samples for each back end and the predictive method.")] = 200,
     bound: Annotated[int, typer.Option("--bound", min=0, max=100_000, help="Samples for the mixed-integer bound; 0: without.")] = 100,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")] = False,
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", show_default=False, help="Write JSON and figures into this folder.")
-    ] = None,
+    as_json: AsJson = False,
+    out: AnswerFolder = None,
 ) -> None:
     """Compare allocation methods on one demand history: tracking, propellant, pulses, travel, optimality, time."""
     failed, factors = _failures(fail or []), (_factors("--priority", priority or []), _factors("--cost", cost or []))
-    if out is not None:
-        from studies.files import check_folder
-
-        check_folder(out)
+    console.check_out(out)
     with console.work():
         from studies import allocation
 
@@ -81,8 +77,7 @@ def compare(
         chosen = None if methods is None else [part.strip() for part in methods.split(",") if part.strip()]
         study = allocation.run(history, chosen=chosen, failed=failed, priority=factors[0], cost=factors[1], slow=slow, bound_samples=bound)
         data = study.to_dict()
-    if out is not None:
-        _write(study, data, out)
+    console.write_answer(out, "allocation", data, figures=study.figures)
     if as_json:
         console.print_text(console.to_json(data))
     else:
@@ -157,14 +152,3 @@ def _print(study: AllocationStudy) -> None:
 
 def _cell(value: Any) -> Any:
     return f"{value:.3g}" if isinstance(value, float) else value
-
-
-def _write(study: AllocationStudy, data: dict[str, Any], out: Path) -> None:
-    from studies.figures import to_svg
-    from studies.files import folder
-
-    with console.work(), folder(out) as place:
-        (place / "allocation.json").write_text(console.to_json(data), encoding="utf-8")
-        for name, figure in study.figures().items():
-            (place / f"{name}.svg").write_text(to_svg(figure), encoding="utf-8")
-    console.say(f"wrote allocation.json and figures into {out}")

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from studies import console
+from studies.cli_options import AnswerFolder, AsJson
 from studies.console import Code, InputError
 
 if TYPE_CHECKING:
@@ -30,10 +30,6 @@ Singles = Annotated[bool, typer.Option("--singles", help="Also fly the stress ca
 Cases = Annotated[int, typer.Option("--dispersions", min=0, max=100_000, help="Random dispersed flights, in compiled code.")]
 Compare = Annotated[bool, typer.Option("--compare", help="Fly the random dispersions under paper, qp and pinv, and compare.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Of the random dispersions.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
-OutFolder = Annotated[
-    Path | None, typer.Option("--out", metavar="DIR", show_default=False, help="Write JSON and figures into this folder.")
-]
 
 
 def blend(
@@ -48,7 +44,7 @@ def blend(
     compare: Compare = False,
     seed: Seed = 2012,
     as_json: AsJson = False,
-    out: OutFolder = None,
+    out: AnswerFolder = None,
 ) -> None:
     """Fly the orbiter through the hand-over from reaction jets to the elevon (STS-1 case of paper 000)."""
     given = _changes(changes or [])
@@ -60,10 +56,7 @@ def blend(
         given["stress"] = math.radians(stress)
     if compare and dispersions < 2:
         raise InputError(f"--compare: needs --dispersions of at least 2, found {dispersions}")
-    if out is not None:
-        from studies.files import check_folder
-
-        check_folder(out)
+    console.check_out(out)
     with console.work():
         from allocation.blending import Handover
         from studies import blend as study_of
@@ -78,8 +71,7 @@ def blend(
 
             methods = compare_methods(cases=dispersions, seed=seed, jets=jets)
             data["methods"] = methods.to_dict()
-    if out is not None:
-        _write(study, data, out)
+    console.write_answer(out, "blend", data, figures=study.figures)
     for remark in study.remarks:
         console.say(f"note: {remark}")
     if as_json:
@@ -125,14 +117,3 @@ def _print(study: BlendStudy) -> None:
 
         table = ensemble_table(study)
         console.print_table(table.title, table.columns, table.rows)
-
-
-def _write(study: BlendStudy, data: dict[str, Any], out: Path) -> None:
-    from studies.figures import to_svg
-    from studies.files import folder
-
-    with console.work(), folder(out) as place:
-        (place / "blend.json").write_text(console.to_json(data), encoding="utf-8")
-        for name, figure in study.figures().items():
-            (place / f"{name}.svg").write_text(to_svg(figure), encoding="utf-8")
-    console.say(f"wrote blend.json and figures into {out}")

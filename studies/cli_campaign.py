@@ -12,6 +12,7 @@ import typer
 from typer.core import TyperGroup
 
 from studies import console
+from studies.cli_options import AsJson, scenario_changes, scenario_file
 from studies.console import Code, InputError
 
 if TYPE_CHECKING:
@@ -33,8 +34,9 @@ app = typer.Typer(
     help="Very many dispersed flights, stored as they come and resumed after any interruption: [SCENARIO.yaml] --out STORE.",
 )  # fmt: skip
 
+_EXAMPLE = "campaign.design=sobol"
+
 Place = Annotated[Path, typer.Argument(metavar="STORE", show_default=False, help="Folder that `reentry campaign --out` wrote.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
 Report = Annotated[
     Path | None,
     typer.Option("--report", metavar="DIR", show_default=False, help="Folder of the report; STORE-report unless given."),
@@ -43,14 +45,8 @@ Report = Annotated[
 
 @app.command()
 def run(
-    scenario: Annotated[
-        Path | None,
-        typer.Argument(metavar="SCENARIO.yaml", show_default=False, help="Scenario; with --resume it may be left out."),
-    ] = None,
-    changes: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", show_default=False, help="Change one key, such as campaign.design=sobol; repeatable."),
-    ] = None,
+    scenario: Annotated[Path | None, scenario_file("Scenario; with --resume it may be left out.")] = None,
+    changes: Annotated[list[str] | None, scenario_changes(_EXAMPLE)] = None,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="STORE", show_default=False, help="New or empty folder of the zarr store.")
     ] = None,
@@ -67,9 +63,9 @@ def run(
     show_scenario: Annotated[bool, typer.Option("--print-scenario", help="Print the scenario with all its keys, and stop.")] = False,
 ) -> None:
     """Fly the campaign of a scenario into a store, and report its statistics."""
-    chosen = _scenario(scenario, changes or [], cases, out if resume else None)
+    chosen = _scenario(scenario, changes, cases, out if resume else None)
     if show_scenario:
-        console.print_text(console.to_json(chosen.to_dict()) if as_json else chosen.to_yaml().rstrip("\n"))
+        console.print_scenario(chosen, as_json=as_json)
         raise typer.Exit
     if out is None:
         raise InputError("--out: not given, expected the folder of the store, such as --out out/campaign")
@@ -140,7 +136,7 @@ def replay(
         raise typer.Exit(Code.CASES_FAILED)
 
 
-def _scenario(path: Path | None, changes: list[str], cases: int | None, store: Path | None) -> Scenario:
+def _scenario(path: Path | None, changes: list[str] | None, cases: int | None, store: Path | None) -> Scenario:
     """The scenario asked for; of a store that is continued, if none is given."""
     from studies import campaign_store
     from studies.scenario import Scenario
@@ -151,13 +147,7 @@ def _scenario(path: Path | None, changes: list[str], cases: int | None, store: P
         chosen = campaign_store.scenario_of(campaign_store.open_store(store))
     else:
         chosen = Scenario.default()
-    edits: dict[str, Any] = {}
-    for text in changes:
-        key, sign, value = text.partition("=")
-        if not sign or not key.strip():
-            raise InputError(f"--set: found {text!r}, expected key=value such as campaign.design=sobol")
-        edits[key.strip()] = value.strip()
-    chosen = chosen.edit(edits, origin="--set")
+    chosen = chosen.edit(console.changes(changes, example=_EXAMPLE), origin="--set")
     if cases is not None:
         chosen = chosen.edit({"campaign.cases": cases}, origin="--cases")
     for remark in chosen.remarks():

@@ -10,6 +10,7 @@ import typer
 from typer.core import TyperGroup
 
 from studies import console
+from studies.cli_options import AsJson, out_folder
 from studies.console import InputError
 
 if TYPE_CHECKING:
@@ -45,8 +46,7 @@ Modes = Annotated[
 Delay = Annotated[int, typer.Option("--delay", min=0, help="Delay of the jets in whole samples.")]
 Sample = Annotated[float, typer.Option("--ts", help="Sampling period, s.")]
 Bias = Annotated[float, typer.Option("--bias", help="Constant disturbance as a fraction of the jets' torque, above -1 and below 1.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
-Out = Annotated[Path | None, typer.Option("--out", metavar="DIR", show_default=False, help="Write a figure into this folder.")]
+Out = Annotated[Path | None, out_folder("Write a figure into this folder.")]
 
 
 @app.command()

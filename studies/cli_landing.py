@@ -9,24 +9,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from studies import console
+from studies.cli_options import AnswerFolder, AsJson, ShowScenario, scenario_changes, scenario_file
 from studies.console import Code, InputError
 
 if TYPE_CHECKING:
     from studies.landing_scenario import LandingScenario
 
-LANDED = ("OK", "OUTSIDE_FOOTPRINT")  # states of a flight that came down to the stop altitude
+_EXAMPLE = "guidance.law=paper"
 _UNITS = {"_s": "s", "_m": "m", "_km": "km", "_g": "g0", "_deg": "deg", "_1km": "%", "_dbeta": "m", "_dtn": "m/s"}
 
 
 def land(
-    scenario: Annotated[
-        Path | None,
-        typer.Argument(metavar="SCENARIO.yaml", show_default=False, help="Landing scenario; keys left out keep those of reference N2."),
-    ] = None,
-    changes: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", show_default=False, help="Change one key, such as guidance.law=paper; repeatable."),
-    ] = None,
+    scenario: Annotated[Path | None, scenario_file("Landing scenario; keys left out keep those of reference N2.")] = None,
+    changes: Annotated[list[str] | None, scenario_changes(_EXAMPLE)] = None,
     reference: Annotated[bool, typer.Option("--reference", help="Fly the reference open loop instead of under guidance.")] = False,
     sensitivities: Annotated[
         bool, typer.Option("--sensitivities", help="With --reference: exact derivatives of the landing point at entry.")
@@ -35,36 +30,31 @@ def land(
         int, typer.Option("--cases", min=0, max=1_000_000, help="Dispersed landings of dispersions.set; 0: one nominal flight.")
     ] = 0,
     seed: Annotated[int | None, typer.Option("--seed", min=0, show_default=False, help="Seed; dispersions.seed unless given.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")] = False,
-    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", show_default=False, help="Write land.json into this folder.")] = None,
-    show: Annotated[bool, typer.Option("--print-scenario", help="Print the scenario with all its keys, ready to edit, and stop.")] = False,
+    as_json: AsJson = False,
+    out: AnswerFolder = None,
+    show: ShowScenario = False,
 ) -> None:
     """Land at a fixed point by prediction and correction: one flight, or many dispersed ones."""
-    chosen = _scenario(scenario, changes or [], seed)
+    chosen = _scenario(scenario, changes, seed)
     if show:
-        console.print_text(console.to_json(chosen.to_dict()) if as_json else chosen.to_yaml().rstrip("\n"))
+        console.print_scenario(chosen, as_json=as_json)
         raise typer.Exit
     if reference and cases:
         raise InputError(f"--cases {cases}: the reference is one flight; leave --cases or --reference out")
     if sensitivities and not reference:
         raise InputError("--sensitivities: belongs to the reference flight, expected --reference beside it")
     from studies import landing_answer
-    from studies.files import check_folder, write_text
 
-    if out is not None:
-        check_folder(out)
-    lost: list[tuple[int, str]] = []
+    console.check_out(out)
     with console.work() as progress:
         if reference:
-            data = landing_answer.reference(chosen, with_sensitivities=sensitivities)
+            answer = landing_answer.reference(chosen, with_sensitivities=sensitivities)
         elif cases == 0:
-            data = landing_answer.single(chosen)
-            lost = [(0, f"{data['status']}: {data['meaning']}")] if data["status"] not in LANDED else []
+            answer = landing_answer.single(chosen)
         else:
-            data, flown = landing_answer.dispersed(chosen, cases, progress=progress)
-            lost = [(i, f"{status.name}: {status.value}") for i, status in enumerate(flown.status) if not status.ok]
-    if out is not None:
-        console.say(f"wrote {write_text(out / 'land.json', console.to_json(data))}")
+            answer = landing_answer.dispersed(chosen, cases, progress=progress)
+    data = answer.data
+    console.write_answer(out, "land", data, figures=answer.figures)
     if as_json:
         console.print_text(console.to_json(data))
     else:
@@ -72,6 +62,7 @@ def land(
     if data.get("status") == "OUTSIDE_FOOTPRINT":
         nearest = data["footprint"]["nearest_m"]
         console.say(f"note: the target lies outside the footprint; the nearest reachable point is {nearest / 1e3:.1f} km from it")
+    lost = answer.lost
     for number, reason in lost[:20]:
         console.say(f"failed: case {number}: {reason}")
     if lost:
@@ -79,17 +70,11 @@ def land(
         raise typer.Exit(Code.CASES_FAILED)
 
 
-def _scenario(path: Path | None, changes: list[str], seed: int | None) -> LandingScenario:
+def _scenario(path: Path | None, changes: list[str] | None, seed: int | None) -> LandingScenario:
     from studies.landing_scenario import LandingScenario
 
     chosen = LandingScenario.load(path) if path is not None else LandingScenario()
-    edits: dict[str, Any] = {}
-    for text in changes:
-        key, sign, value = text.partition("=")
-        if not sign or not key.strip():
-            raise InputError(f"--set: found {text!r}, expected key=value such as guidance.law=paper")
-        edits[key.strip()] = value.strip()
-    chosen = chosen.edit(edits, origin="--set")
+    chosen = chosen.edit(console.changes(changes, example=_EXAMPLE), origin="--set")
     return chosen if seed is None else chosen.edit({"dispersions.seed": seed}, origin="--seed")
 
 

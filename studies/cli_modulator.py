@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from studies import console
+from studies.cli_options import AsJson, out_folder
 from studies.console import InputError
 
 if TYPE_CHECKING:
@@ -34,9 +35,7 @@ Sample = Annotated[float, typer.Option("--ts", help="Sample time, s, > 0; from 2
 Low = Annotated[float, typer.Option("--dead-low", help="Width of the dead zone below zero, >= 0.")]
 High = Annotated[float, typer.Option("--dead-high", help="Width of the dead zone above zero, >= 0.")]
 Demand = Annotated[float, typer.Option("--r", help="Constant demand as a fraction of full thrust.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
-OutFolder = Annotated[Path | None, typer.Option("--out", metavar="DIR", show_default=False, help="Write data and figure into this folder.")]
-
+OutFolder = Annotated[Path | None, out_folder("Write data and figure into this folder.")]
 
 _LARGEST = 1e6  # amplitude of a demand
 _UNKNOWN = 1e-6  # share of the states that may be in no basin without a word about it

@@ -11,8 +11,14 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import IntEnum
+from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from studies.scenario_document import ScenarioDocument
 
 Progress = Callable[[str, float], None]
 
@@ -101,19 +107,64 @@ def to_json(data: Mapping[str, Any]) -> str:
 
 
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    """Table on stdout; cells are shown as they are, never read as markup."""
+    """Table on stdout, in parts where the terminal is too narrow; cells are shown as they are, never read as markup."""
     from rich.console import Console
-    from rich.table import Table
     from rich.text import Text
 
-    table = Table(title=Text(title), title_justify="left")
-    for i, column in enumerate(columns):
-        numeric = bool(rows) and all(isinstance(row[i], (int, float)) for row in rows)
-        table.add_column(Text(column), justify="right" if numeric else "left", overflow="fold")
-    for row in rows:
-        table.add_row(*(Text(_cell(value)) for value in row))
-    Console(highlight=False).print(table)
+    from studies.console_tables import tables
+
+    screen = Console(highlight=False)
+    numeric = [bool(rows) and all(isinstance(row[i], (int, float)) for row in rows) for i in range(len(columns))]
+    cells = [[_cell(value) for value in row] for row in rows]
+    for number, table in enumerate(tables(columns, cells, numeric=numeric, width=screen.width)):
+        table.title = None if number else Text(title)
+        screen.print(table)
     sys.stdout.flush()
+
+
+def print_scenario(scenario: ScenarioDocument, *, as_json: bool) -> None:
+    """A scenario with all its keys on stdout: YAML ready to edit, or JSON."""
+    print_text(to_json(scenario.to_dict()) if as_json else scenario.to_yaml().rstrip("\n"))
+
+
+def changes(texts: Sequence[str] | None, *, example: str) -> dict[str, str]:
+    """Keys and values of ``--set KEY=VALUE``; of a key that is given twice the last value counts.
+
+    Raises
+    ------
+    InputError
+        A text without key or equals sign; `example` is named in its message.
+    """
+    found = {}
+    for text in texts or ():
+        key, sign, value = text.partition("=")
+        if not sign or not key.strip():
+            raise InputError(f"--set: found {text!r}, expected key=value such as {example}")
+        found[key.strip()] = value.strip()
+    return found
+
+
+def check_out(out: Path | None) -> None:
+    """Refuse an output folder that cannot be one, before the work begins; without a folder nothing is asked."""
+    if out is not None:
+        from studies.files import check_folder
+
+        check_folder(out)
+
+
+def write_answer(out: Path | None, name: str, data: Mapping[str, Any], *, figures: Callable[[], Mapping[str, Figure]]) -> None:
+    """Write ``name.json`` and each figure as SVG into a folder, all or nothing, and say so; without a folder nothing is drawn."""
+    if out is None:
+        return
+    from studies.figures import to_svg
+    from studies.files import folder
+
+    with work(), folder(out) as place:
+        (place / f"{name}.json").write_text(to_json(data), encoding="utf-8")
+        drawn = figures()
+        for title, figure in drawn.items():
+            (place / f"{title}.svg").write_text(to_svg(figure), encoding="utf-8")
+    say(f"wrote {name}.json{' and figures' if drawn else ''} into {out}")
 
 
 @contextlib.contextmanager

@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 import io
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeVar
 
 import matplotlib.style
 import numpy as np
@@ -17,6 +17,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from models.checked import ModelError
+from studies.result import FigureItem
+
+Study = TypeVar("Study")
+Maker = tuple[str, str, str, Callable[[Study], Any]]  # name, title, caption, function that draws the figure of a study
 
 # Okabe and Ito, "Color Universal Design", 2008: distinct for the common kinds of colour blindness.
 # Yellow is left out: a thin yellow line cannot be seen on white paper.
@@ -216,6 +220,23 @@ def to_png(figure: Figure, *, dpi: float = 200.0) -> bytes:
     with style():
         figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
     return buffer.getvalue()
+
+
+def items(makers: Iterable[Maker[Study]], study: Study) -> list[FigureItem]:
+    """Draw the figures of a study in the publication style.
+
+    Parameters
+    ----------
+    makers : iterable of (name, title, caption, function)
+        The function takes the study and returns a matplotlib Figure.
+    study
+        Handed to each function.
+    """
+    drawn = []
+    for name, title, caption, make in makers:
+        with style():
+            drawn.append(FigureItem(name, title, caption, make(study)))
+    return drawn
 
 
 def width_mm(figure: Figure) -> float:

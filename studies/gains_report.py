@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -70,7 +69,7 @@ def headlines(study: GainsStudy) -> list[Headline]:
 
 def figures(study: GainsStudy) -> list[FigureItem]:
     """All figures of the study."""
-    makers: list[tuple[str, str, str, Callable[[GainsStudy], Any]]] = [
+    makers: list[fig.Maker[GainsStudy]] = [
         (
             "gains", "Feedback gains along the reference",
             "Gains K(t) of the Riccati equation (paper's sign, ungated), their time means (K3 split) and the printed constants."
@@ -98,11 +97,7 @@ def figures(study: GainsStudy) -> list[FigureItem]:
             "Share of the cases with a range error below the abscissa; the same cases under every schedule. "
             "Printed constants and time means lie on one another for reference N1.", miss_figure,
         ))  # fmt: skip
-    items = []
-    for name, title, caption, make in makers:
-        with fig.style():
-            items.append(FigureItem(name, title, caption, make(study)))
-    return items
+    return fig.items(makers, study)
 
 
 def gain_figure(study: GainsStudy) -> Any:

@@ -1,35 +1,76 @@
-"""Answers of ``reentry land``: one flight, or a dispersed set, as plain data."""
+"""Answers of ``reentry land``: one flight, or a dispersed set, as plain data and figures."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from models.core import Array, Status
 from models.units import DEG, KM
-from ocp.landing import Landings
+from ocp.landing import Landings, Target
+from ocp.trajectory import Trajectory
 from studies import landing_flight as flights
 from studies.landing_scenario import LandingScenario
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+LANDED = ("OK", "OUTSIDE_FOOTPRINT")  # states of a flight that came down to the stop altitude
 DOUBTFUL = 2 * KM  # a miss beyond it is asked whether the target could be reached at all
 MOST_ASKED = 50  # cases for which it is asked
 
 Progress = Callable[..., None]
 
 
-def reference(scenario: LandingScenario, *, with_sensitivities: bool) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """What the command has found.
+
+    Attributes
+    ----------
+    data : dict
+        Plain data, ready for JSON.
+    flown : Trajectory or Landings
+        The one flight with all its nodes, or the ends of a dispersed set.
+    target : Target
+    """
+
+    data: dict[str, Any]
+    flown: Trajectory | Landings
+    target: Target
+
+    @property
+    def lost(self) -> list[tuple[int, str]]:
+        """(case number, reason) of the guided flights that did not come down to the stop altitude."""
+        if isinstance(self.flown, Trajectory):
+            status = self.data["status"]
+            return [(0, f"{status}: {self.data['meaning']}")] if "meaning" in self.data and status not in LANDED else []
+        return [(i, f"{status.name}: {status.value}") for i, status in enumerate(self.flown.status) if not status.ok]
+
+    def figures(self) -> dict[str, Figure]:
+        """Figures by name: the flight; or misses, their distribution and what they cost, of the flights that landed."""
+        from studies.landing_report import flown_figures, landed_figures
+
+        law = self.data["law"]
+        if isinstance(self.flown, Trajectory):
+            return flown_figures(law, self.flown, target=self.target)
+        return landed_figures(law, self.flown)
+
+
+def reference(scenario: LandingScenario, *, with_sensitivities: bool) -> Answer:
     """The open-loop reference flight; its target may be that of another scenario, which then shows as a miss."""
     set_up = flights.setting(scenario)
     flown = flights.reference_flight(scenario, set_up)
     data: dict[str, Any] = {"law": "reference", "status": flown.status.name, "flight": flights.told(set_up, flown, banks=flown["bank"])}
     if with_sensitivities:
         data["sensitivities"] = flights.sensitivities(scenario, set_up)
-    return data
+    return Answer(data, flown, set_up.target)
 
 
-def single(scenario: LandingScenario) -> dict[str, Any]:
+def single(scenario: LandingScenario) -> Answer:
     """The nominal flight under the guidance law, and whether its target can be reached."""
     set_up = flights.setting(scenario)
     law = flights.guidance(scenario, set_up)
@@ -39,7 +80,7 @@ def single(scenario: LandingScenario) -> dict[str, Any]:
     data: dict[str, Any] = {"law": scenario.guidance.law, "status": flown.status.name, "meaning": flown.status.value, "flight": numbers}
     if flown.status.ok:
         data |= reachability(set_up, case.x0[0], case.p[0], numbers)
-    return data
+    return Answer(data, flown, set_up.target)
 
 
 def reachability(set_up: flights.Setting, x0: Array, p: Array, numbers: Mapping[str, float]) -> dict[str, Any]:
@@ -50,7 +91,7 @@ def reachability(set_up: flights.Setting, x0: Array, p: Array, numbers: Mapping[
     return {"status": status.name, "meaning": status.value, "footprint": {"inside": status.ok, **nearest}}
 
 
-def dispersed(scenario: LandingScenario, count: int, *, progress: Progress | None = None) -> tuple[dict[str, Any], Landings]:
+def dispersed(scenario: LandingScenario, count: int, *, progress: Progress | None = None) -> Answer:
     """Statistics of a dispersed set, and the flights."""
     set_up = flights.setting(scenario)
     law = flights.guidance(scenario, set_up)
@@ -70,7 +111,7 @@ def dispersed(scenario: LandingScenario, count: int, *, progress: Progress | Non
         if status is Status.OUTSIDE_FOOTPRINT:
             outside.append({"case": int(i), "nearest_m": distance, "miss_m": float(landed.distance[i])})
     data["outside_footprint"] = {"asked": int(min(len(doubtful), MOST_ASKED)), "outside": len(outside), "cases": outside}
-    return data, landed
+    return Answer(data, landed, set_up.target)
 
 
 def statistics(landed: Landings) -> dict[str, Any]:

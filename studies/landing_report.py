@@ -12,10 +12,17 @@ from studies.landing_answer import statistics
 from studies.result import Comparison, FigureItem, Headline, StudyResult, Table
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from ocp.landing import Landings, Target
+    from ocp.trajectory import Trajectory
     from studies.landing import LandingStudy
 
 NAMES = {"paper": "one reversal", "modern": "several reversals"}
-SHADES = {"paper": "C1", "modern": "C0"}
+SHADES = {"paper": "C1", "modern": "C0", "reference": "C2"}
 
 LEAD = (
     "Tian (1998) lands a capsule at a given point by predicting its landing point on board and correcting the bank angle: its amplitude"
@@ -116,26 +123,26 @@ def figures(study: LandingStudy) -> list[FigureItem]:
          "ground track across the great circle to the target.", flight_figure),
         ("landing_trade", "What accuracy costs", "Greatest load and bank travel of every case of the hard set.", trade_figure),
     ]  # fmt: skip
-    items = []
-    for name, title, caption, make in makers:
-        with fig.style():
-            items.append(FigureItem(name, title, caption, make(study)))
-    return items
+    return fig.items(makers, study)
 
 
 def miss_figure(study: LandingStudy) -> Any:
     """Cross-range against downrange of the hard set."""
     figure, axes = fig.new_figure(1, 2, height_mm=80)
-    angle = np.linspace(0, 2 * np.pi, 200)
-    for axis, (law, name), limit in zip(np.ravel(axes), NAMES.items(), (4.0, 1.2), strict=True):
-        landed = study.flown[law, "hard"]
-        km = landed.miss[landed.ok] / KM
-        axis.plot(np.cos(angle), np.sin(angle), color="0.4", linewidth=0.8)
-        axis.plot(km[:, 1], km[:, 0], ".", color=SHADES[law], markersize=3)
-        beyond = int((np.abs(km) > limit).any(axis=1).sum())
-        axis.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal", xlabel="cross-range [km]", ylabel="downrange [km]")
-        axis.set_title(name + (f" ({beyond} beyond the frame)" if beyond else ""))
+    for axis, law, limit in zip(np.ravel(axes), NAMES, (4.0, 1.2), strict=True):
+        _misses(axis, law, study.flown[law, "hard"], limit=limit)
     return figure
+
+
+def _misses(axis: Axes, law: str, landed: Landings, *, limit: float) -> None:
+    """Misses around a circle of 1 km, in a frame of `limit` km to each side."""
+    angle = np.linspace(0, 2 * np.pi, 200)
+    km = landed.miss[landed.ok] / KM
+    axis.plot(np.cos(angle), np.sin(angle), color="0.4", linewidth=0.8)
+    axis.plot(km[:, 1], km[:, 0], ".", color=SHADES[law], markersize=3)
+    beyond = int((np.abs(km) > limit).any(axis=1).sum())
+    axis.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal", xlabel="cross-range [km]", ylabel="downrange [km]")
+    axis.set_title(NAMES[law] + (f" ({beyond} beyond the frame)" if beyond else ""))
 
 
 def share_figure(study: LandingStudy) -> Any:
@@ -144,14 +151,18 @@ def share_figure(study: LandingStudy) -> Any:
     lines = {"density": ":", "small": "-.", "medium": "--", "hard": "-"}
     for axis, (law, title) in zip(np.ravel(axes), NAMES.items(), strict=True):
         for name, line in lines.items():
-            landed = study.flown[law, name]
-            km = np.sort(landed.distance[landed.ok]) / KM
-            axis.semilogx(km, 100 * np.arange(1, len(km) + 1) / len(landed.ok), line, color=SHADES[law], label=name)
+            _share(axis, law, study.flown[law, name], line=line, label=name)
         axis.axvline(1.0, color="0.4", linewidth=0.8)
         axis.set(xlabel="miss [km]", xlim=(3e-3, 10), title=title)
     np.ravel(axes)[0].set_ylabel("cases [%]")
     np.ravel(axes)[0].legend(loc="upper left")
     return figure
+
+
+def _share(axis: Axes, law: str, landed: Landings, *, line: str = "-", label: str | None = None) -> None:
+    """Share of the cases, the lost ones among them, with a miss below the abscissa."""
+    km = np.sort(landed.distance[landed.ok]) / KM
+    axis.semilogx(km, 100 * np.arange(1, len(km) + 1) / len(landed.ok), line, color=SHADES[law], label=label)
 
 
 def footprint_figure(study: LandingStudy) -> Any:
@@ -177,14 +188,19 @@ def footprint_figure(study: LandingStudy) -> Any:
 
 def flight_figure(study: LandingStudy) -> Any:
     """Nominal flights under both laws."""
+    return _flights(study.nominal, study.set_up.target)
+
+
+def _flights(flown: Mapping[str, Trajectory], target: Target) -> Figure:
+    """Bank angle, load, altitude against speed and ground track of flights, by the name of the law."""
     figure, axes = fig.small_multiples(["bank angle", "load", "altitude and speed", "ground track"], cols=2, panel_height_mm=50)
-    for law, name in NAMES.items():
-        flown, color = study.nominal[law], SHADES[law]
-        r, v = np.column_stack([flown[n] for n in "xyz"]), np.column_stack([flown[n] for n in "uvw"])
-        miss = study.set_up.target.miss(r) / KM
-        axes[0].plot(flown.t, flown["bank"] / DEG, color=color, label=name)
-        axes[1].plot(flown.t, flown["load"], color=color)
-        axes[2].plot(np.linalg.norm(v, axis=1) / KM, flown["h"] / KM, color=color)
+    for law, flight in flown.items():
+        color = SHADES[law]
+        r, v = np.column_stack([flight[n] for n in "xyz"]), np.column_stack([flight[n] for n in "uvw"])
+        miss = target.miss(r) / KM
+        axes[0].plot(flight.t, flight["bank"] / DEG, color=color, label=NAMES.get(law, law))
+        axes[1].plot(flight.t, flight["load"], color=color)
+        axes[2].plot(np.linalg.norm(v, axis=1) / KM, flight["h"] / KM, color=color)
         axes[3].plot(miss[:, 0], miss[:, 1], color=color)
     axes[0].set(xlabel="time [s]", ylabel="bank angle [deg]")
     axes[0].legend(loc="lower left")
@@ -198,9 +214,35 @@ def trade_figure(study: LandingStudy) -> Any:
     """Greatest load against bank travel of the hard set."""
     figure, axis = fig.new_figure(1, 1, width_mm=100, height_mm=70)
     axis = np.ravel(axis)[0]
-    for law, name in NAMES.items():
-        landed = study.flown[law, "hard"]
-        axis.plot(landed["travel"][landed.ok] / DEG, landed["peak"][landed.ok], ".", color=SHADES[law], label=name)
-    axis.set(xlabel="bank travel [deg]", ylabel="greatest load [g$_0$]")
+    for law in NAMES:
+        _cost(axis, law, study.flown[law, "hard"])
     axis.legend(loc="upper center")
     return figure
+
+
+def _cost(axis: Axes, law: str, landed: Landings) -> None:
+    """Greatest load against bank travel of the cases that landed."""
+    axis.plot(landed["travel"][landed.ok] / DEG, landed["peak"][landed.ok], ".", color=SHADES[law], label=NAMES[law])
+    axis.set(xlabel="bank travel [deg]", ylabel="greatest load [g$_0$]")
+
+
+def flown_figures(law: str, flown: Trajectory, *, target: Target) -> dict[str, Figure]:
+    """Figure of one flight, under a law or of the open-loop reference."""
+    with fig.style():
+        return {"landing_bank": _flights({law: flown}, target)}
+
+
+def landed_figures(law: str, landed: Landings) -> dict[str, Figure]:
+    """Figures of one dispersed set under one law; none if no flight landed."""
+    if not landed.ok.any():
+        return {}
+    with fig.style():
+        figure, axes = fig.new_figure(1, 2, height_mm=80)
+        frame = max(1.2, 1.05 * float(np.abs(landed.miss[landed.ok]).max()) / KM)
+        _misses(axes[0, 0], law, landed, limit=frame)
+        _share(axes[0, 1], law, landed)
+        axes[0, 1].axvline(1.0, color="0.4", linewidth=0.8)
+        axes[0, 1].set(xlabel="miss [km]", ylabel="cases [%]")
+        trade, axes = fig.new_figure(1, 1, width_mm=100, height_mm=70)
+        _cost(axes[0, 0], law, landed)
+    return {"landing_miss": figure, "landing_trade": trade}

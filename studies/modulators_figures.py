@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,7 +29,7 @@ KINDS = (  # of the map: what exists besides {0}, colour
 
 def figures(study: ModulatorStudy) -> list[FigureItem]:
     """All figures of the study, in the order of the paper."""
-    makers: list[tuple[str, str, str, Callable[[ModulatorStudy], Any]]] = [
+    makers: list[fig.Maker[ModulatorStudy]] = [
         (
             "modulator_duty", "Duty cycle against a constant demand (Fig. 3)",
             "Continuous modulator by its closed form; sampled ones exactly, from the word in which the orbit from rest ends.", duty_figure,
@@ -60,11 +59,7 @@ def figures(study: ModulatorStudy) -> list[FigureItem]:
             "right: the part around the schemes of Table 4.", map_figure,
         ),
     ]  # fmt: skip
-    items = []
-    for name, title, caption, make in makers:
-        with fig.style():
-            items.append(FigureItem(name, title, caption, make(study)))
-    return items
+    return fig.items(makers, study)
 
 
 def duty_figure(study: ModulatorStudy) -> Any:

@@ -180,7 +180,10 @@ def test_answer_is_written_and_shown(tmp_path, capsys):
     told = land(capsys, "--reference", "--out", str(tmp_path / "a"))
     assert "541.273" in told.out
     assert json.loads((tmp_path / "a" / "land.json").read_text(encoding="utf-8"))["flight"]["reversals"] == 1
+    assert (tmp_path / "a" / "landing_bank.svg").read_text(encoding="utf-8").startswith("<svg")
     assert "reversal_at_s" in land(capsys, "--print-scenario").out
+    land(capsys, "--cases", "3", "--out", str(tmp_path / "b"))
+    assert {path.name for path in (tmp_path / "b").iterdir()} == {"land.json", "landing_miss.svg", "landing_trade.svg"}
 
 
 @compiled
