@@ -43,6 +43,7 @@ _LIBM = {
 _LIBM2 = {
     ca.OP_POW: "pow", ca.OP_CONSTPOW: "pow", ca.OP_ATAN2: "atan2", ca.OP_HYPOT: "hypot", ca.OP_FMOD: "fmod", ca.OP_REMAINDER: "remainder"
 }  # fmt: skip
+_WITH_A_NUMBER = {ca.OP_FMIN: "lane_least({0}, {1})", ca.OP_FMAX: "lane_most({0}, {1})"}  # where the second is a constant, not NaN
 _COMPARISONS = {ca.OP_LT: "({0} < {1})", ca.OP_LE: "({0} <= {1})", ca.OP_EQ: "({0} == {1})", ca.OP_NE: "({0} != {1})"}
 _LOGIC = {ca.OP_NOT: "(~{0})", ca.OP_AND: "({0} & {1})", ca.OP_OR: "({0} | {1})"}
 
@@ -130,12 +131,10 @@ class Unit:
     def source(self, driver: str) -> str:
         """The whole file."""
         scalars = scalar_code(self.scalars, unit=f"{PREFIX}scalars") if self.scalars else ""
-        return (
-            scalars
-            + prologue(self.lanes, tuple(_LIBM.values()), tuple(dict.fromkeys(_LIBM2.values())), fast=self.fast)
-            + "".join(self.text)
-            + driver
-        )
+        body = "".join(self.text) + driver
+        extremes = any(f"lane_{name}(" in body for name in ("fmin", "fmax", "least", "most"))
+        names = (tuple(_LIBM.values()), tuple(dict.fromkeys(_LIBM2.values())))
+        return scalars + prologue(self.lanes, *names, fast=self.fast, extremes=extremes) + body
 
     def _write(self, function: ca.Function) -> str:
         name = f"{PREFIX}f{len(self.names)}_{len(self.kept)}"
@@ -168,6 +167,7 @@ class Value:
 
     text: str
     mask: bool = False
+    number: bool = False  # a constant that is not NaN
     part: int = -1  # -1: a constant or an input, written out at every use
     last: int = -1
     slot: int = -1
@@ -214,7 +214,8 @@ class _Writer:
         for k in range(f.n_instructions()):
             op, part = f.instruction_id(k), count // PART
             if op == ca.OP_CONST:
-                slots[f.instruction_output(k)[0]] = Value(f"lane_all({literal(f.instruction_constant(k))})")
+                constant = f.instruction_constant(k)
+                slots[f.instruction_output(k)[0]] = Value(f"lane_all({literal(constant)})", number=constant == constant)
                 continue
             if op == ca.OP_INPUT:
                 i, nonzero = f.instruction_input(k)
@@ -236,7 +237,7 @@ class _Writer:
                 value = Value(f"a{k}", mask=op in _COMPARISONS or op in _LOGIC, part=part)
                 slots[f.instruction_output(k)[0]] = value
                 kind = "M" if value.mask else "L"
-                yield _Step(part, f"{kind} a{k} = {_template(op)};", operands, [value], op in _LOGIC, op == ca.OP_IF_ELSE_ZERO)
+                yield _Step(part, f"{kind} a{k} = {_template(op, operands)};", operands, [value], op in _LOGIC, op == ca.OP_IF_ELSE_ZERO)
 
     def _call(self, callee: ca.Function, k: int, part: int, operands: list[Value], slots: dict[int, Value]) -> _Step:
         """Calls pass dense columns; nonzeros of a sparse argument are put in their places, others are zero."""
@@ -308,13 +309,15 @@ class _Step:
         return self.template.format(*texts)
 
 
-def _template(op: int) -> str:
+def _template(op: int, operands: Sequence[Value]) -> str:
     if op in _LIBM:
         return f"lane_{_LIBM[op]}({{0}})"
     if op in _LIBM2:
         return f"lane_{_LIBM2[op]}({{0}}, {{1}})"
     if op == ca.OP_IF_ELSE_ZERO:
         return "lane_pick({0}, {1})"
+    if op in _WITH_A_NUMBER and operands[1].number:
+        return _WITH_A_NUMBER[op]
     for table in (_NUMBERS, _COMPARISONS, _LOGIC):
         if op in table:
             return table[op]
