@@ -135,18 +135,24 @@ class AllocationStudy:
     failed: Mapping[str, float | None] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data for JSON; what a method has no number for is None."""
+        """Plain data for JSON; what a method has no number for is None.
+
+        "methods": each on the samples that it was asked for; "same_samples": all on the samples that the slowest was asked for.
+        """
         history = self.comparison.history
-        table = [
-            {key: (None if isinstance(value, str) and key != "method" else value) for key, value in zip(_KEYS, row, strict=True)}
-            for row in self.comparison.rows()
+        tables = [
+            [
+                {key: (None if isinstance(value, str) and key != "method" else value) for key, value in zip(_KEYS, row, strict=True)}
+                for row in self.comparison.rows(same=same)
+            ]
+            for same in (False, True)
         ]
         return {
             "history": {
                 "name": history.name, "samples": len(history), "dt_s": history.dt, "axes": list(history.effectors.axes),
                 "effectors": list(history.effectors.names), "failed": dict(self.failed),
             },
-            "methods": table,
+            "methods": tables[0], "same_samples": tables[1],
         }  # fmt: skip
 
     def figures(self) -> dict[str, Figure]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -87,38 +88,59 @@ class MethodComparison:
 
     def interval(self, method: str, quantity: str) -> tuple[float, float]:
         """Mean and half-width of its 95 % confidence interval (Student's t) over the flights kept."""
-        values = np.asarray(getattr(self.found[method], quantity))[self.kept]
-        n = len(values)
-        if n < 2:
-            raise ModelError(f"compare: {n} flights kept, expected at least two; fly more dispersions")
-        return float(values.mean()), float(stdtrit(n - 1, 0.5 + 0.5 * CONFIDENCE) * values.std(ddof=1) / math.sqrt(n))
+        return _interval(self._kept(method, quantity))
 
     def difference(self, method: str, other: str, quantity: str) -> tuple[float, float]:
         """As :meth:`interval`, of the difference flight by flight: narrower, since both meet the same dispersions."""
-        values = (np.asarray(getattr(self.found[method], quantity)) - np.asarray(getattr(self.found[other], quantity)))[self.kept]
-        return float(values.mean()), float(stdtrit(len(values) - 1, 0.5 + 0.5 * CONFIDENCE) * values.std(ddof=1) / math.sqrt(len(values)))
+        return _interval(self._kept(method, quantity) - self._kept(other, quantity))
+
+    def _kept(self, method: str, quantity: str) -> np.ndarray:
+        return np.asarray(getattr(self.found[method], quantity), dtype=float)[self.kept]
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able result."""
-        rows = {
-            method: {name: dict(zip(("mean", "half_width"), self.interval(method, name), strict=True)) for name, _ in COMPARED}
-            for method in self.found
-        }
-        return {"cases": len(self.kept), "kept": int(self.kept.sum()), "confidence": CONFIDENCE, "methods": rows}
+        first, *others = self.found
+
+        def named(value: tuple[float, float]) -> dict[str, float]:
+            return {"mean": value[0], "half_width": value[1]}
+
+        return {
+            "cases": len(self.kept), "kept": int(self.kept.sum()), "confidence": CONFIDENCE,
+            "methods": {method: {name: named(self.interval(method, name)) for name, _ in COMPARED} for method in self.found},
+            f"differences_from_{first}": {
+                method: {name: named(self.difference(method, first, name)) for name, _ in COMPARED} for method in others
+            },
+        }  # fmt: skip
 
     def table(self) -> Table:
-        """One row for each method."""
+        """One row for each method: means with their confidence intervals."""
+        return self._table("Methods over the same dispersed flights", "Means", {m: partial(self.interval, m) for m in self.found})
+
+    def differences(self) -> Table:
+        """One row for each method but the first: mean difference from that, flight by flight, with confidence intervals."""
+        first, *others = self.found
+        rows = {m: partial(self.difference, m, first) for m in others}
+        return self._table(f"Differences from {first}, flight by flight", "Mean differences", rows)
+
+    def _table(self, title: str, what: str, rows: Mapping[str, Callable[[str], tuple[float, float]]]) -> Table:
         from studies.result import Table
 
-        rows = []
-        for method in self.found:
-            cells = [self.interval(method, name) for name, _ in COMPARED]
-            rows.append([method, *(f"{mean:.4g} ± {half:.2g}" for mean, half in cells)])
+        def cell(value: tuple[float, float]) -> str:
+            return f"{value[0]:.4g} ± {value[1]:.2g}"
+
+        cells = [[method, *(cell(row(name)) for name, _ in COMPARED)] for method, row in rows.items()]
         return Table(
-            "Methods over the same dispersed flights", ("method", *(label for _, label in COMPARED)), rows,
-            f"Means with 95 % confidence intervals over {int(self.kept.sum())} of {len(self.kept)} flights,"
+            title, ("method", *(label for _, label in COMPARED)), cells,
+            f"{what} with 95 % confidence intervals over {int(self.kept.sum())} of {len(self.kept)} flights,"
             " those in authority under every method.",
         )  # fmt: skip
+
+
+def _interval(values: np.ndarray) -> tuple[float, float]:
+    n = len(values)
+    if n < 2:
+        raise ModelError(f"compare: {n} flights kept, expected at least two; fly more dispersions")
+    return float(values.mean()), float(stdtrit(n - 1, 0.5 + 0.5 * CONFIDENCE) * values.std(ddof=1) / math.sqrt(n))
 
 
 def compare(methods: Sequence[str] = ("paper", "qp", "pinv"), *, cases: int = 200, seed: int = 2012, jets: int = 6) -> MethodComparison:

@@ -140,14 +140,19 @@ def _number(option: str, text: str, value: str) -> float:
 
 
 def _print(study: AllocationStudy) -> None:
+    found, history = study.comparison, study.comparison.history
     columns = ("method", "rms", "worst", "kg", "pulses", "deg", "KKT", "bad", "us", "n")
-    history = study.comparison.history
-    rows = [tuple(_cell(value) for value in row) for row in study.comparison.rows()]
+    rows = [tuple(_cell(value) for value in row) for row in found.rows()]
     console.print_table(f"{history.name}: {len(history)} samples, {len(history.effectors.names)} effectors", columns, rows)
     console.print_text(
         "rms, worst: error in parts of the largest demand on the axis; kg: propellant; deg: travel of the surfaces;\n"
-        "KKT: largest residual; bad: answers without a proof; us: time per solve; n: samples (compare kg only at the same n)."
+        "KKT: largest residual; bad: answers without a proof; us: time per solve; n: samples.\n"
+        "Every method but the on-off bound keeps to the rates of the surfaces."
     )
+    if found.same != found.outcomes:
+        n = len(found.same[0].samples)
+        fewer = [tuple(_cell(value) for value in (*row[:4], *row[6:8])) for row in found.rows(same=True)]
+        console.print_table(f"All methods on the same {n} samples", ("method", "rms", "worst", "kg", "KKT", "bad"), fewer)
 
 
 def _cell(value: Any) -> Any:

@@ -79,8 +79,8 @@ def blend(
     else:
         _print(study)
         if methods is not None:
-            table = methods.table()
-            console.print_table(table.title, table.columns, table.rows)
+            for table in (methods.table(), methods.differences()):
+                console.print_table(table.title, table.columns, table.rows)
     for number in study.failed[:20]:
         console.say(f"failed: case {number} of the dispersions: a number was not finite")
     if study.failed:

@@ -119,7 +119,21 @@ def test_the_command_compares_own_data(files, capsys):
     assert data["methods"][1]["worst_kkt"] is None
     assert {p.name for p in (files / "out").iterdir()} == {"allocation.json", "residuals.svg", "attainable.svg"}
     assert cli.main(options(files, "--methods", "qp")) == 0
-    assert "QP (own)" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "QP (own)" in printed
+    assert "same" not in printed
+
+
+def test_the_command_compares_on_the_same_samples(files, capsys):
+    chosen = options(files, "--methods", "qp,daqp", "--slow", "2")
+    assert cli.main([*chosen, "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    own, other = data["same_samples"]
+    assert data["methods"][0]["samples"] > own["samples"] == other["samples"] == data["methods"][1]["samples"] == 2
+    for key in ("rms", "worst", "propellant_kg"):
+        assert own[key] == pytest.approx(other[key], rel=1e-6, abs=1e-9)
+    assert cli.main(chosen) == 0
+    assert "All methods on the same 2 samples" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
