@@ -105,6 +105,11 @@ def usable(y: Expression) -> Expression:
     return ca.if_else(ca.fabs(y) < HUGE, y, 0.0)
 
 
+def beginning(demand: Expression, y: Expression) -> Expression:
+    """Prices to begin with: usable ones, and zero for a demand of zero, which leaves nothing to be relative to but exact zeros."""
+    return ca.if_else(ca.sumsqr(demand) == 0, 0.0, usable(y))
+
+
 def _matrix(q: Problem, free: ca.SX) -> ca.SX:
     """Jacobian of F for a set of free effectors (ones and zeros): diag(1/W^2) + B_F diag(1/b^2) B_F'."""
     m, n = q.B.shape
@@ -315,7 +320,7 @@ def solver(m: int, n: int, *, count: int = 0, name: str = "wls") -> ca.Function:
     """
     columns, problem = symbols(m, n)
     start = ca.SX.sym("y", m)
-    y, settled = usable(start), ca.SX(0.0)
+    y, settled = beginning(problem.demand, start), ca.SX(0.0)
     number = count or (3 if m == 1 else 12)
     once = _one_step(m, n, name=f"{name}_step", apart=False)
     if number * once.n_instructions() > WRITTEN_OUT:

@@ -4,13 +4,13 @@ Each gets the problem in the same normalized form, with refinement: variables in
 between the largest cost and the tracking weight.  At the wanted ratio of 3e-4 a first-order method calls an answer solved that gives
 half of the demand to each of two effectors, since its own measure is dominated by W^2.  What the milder ratio leaves of the demand is
 added to it, and the problem solved again (method of multipliers), until the KKT residuals of the *wanted* problem are small; they,
-and not the solver's word, decide.
+and not the solver's word, decide.  Active-set and interior-point methods are asked for the wanted problem first; the best answer counts.
 """
 
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -23,6 +23,8 @@ MILD = 0.03
 ACCEPTED = 1e-5  # KKT residual above which an answer of a back end is not called solved
 REFINEMENTS = 8
 FEWEST = 3  # before no gain means the end
+ENOUGH = 1e-10  # KKT residual at which refinement ends
+AT_ONCE = ("clarabel", "daqp", "lsq_linear", "piqp", "quadprog")  # these may well solve the wanted problem itself: asked for it first
 _SPARSE = ("clarabel", "highs", "osqp")
 _OPTIONS: dict[str, dict[str, Any]] = {
     "clarabel": {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-11},
@@ -88,28 +90,32 @@ class Backend:
         matrix = self.B if B is None else as_finite("B", B)
         W, b = (self.axis if axis is None else axis), (self.effector if effector is None else effector)
         scaled = _Scaled.of(matrix, v, W, b, self.preferred, lower, upper)
-        best: tuple[Array, Array] | None = None
+
+        def judged(z: Array, price: Array) -> tuple[Array, Array]:
+            """Commands with the better of two proofs: that price, and W^2 times what is missed, sharper where much is missed."""
+            u = np.clip(z / scaled.size, lower, upper)
+            limits = {"lower": lower, "upper": upper, "axis": W, "effector": b, "preferred": self.preferred}
+            proofs = [residuals(matrix, v, u, **limits, price=y) for y in (price * scaled.unit * W, None)]
+            return u, min(proofs, key=lambda r: float(r.max()))
+
+        best: tuple[Array, Array] = np.clip(self.preferred, lower, upper), np.full(3, np.inf)
+        if self.name in AT_ONCE and scaled.mild < 1:
+            z = self._once(replace(scaled, mild=1.0), scaled.v)
+            best = best if z is None else judged(z, scaled.v - scaled.A @ z)
         price = np.zeros(len(v))  # of the scaled problem, W^2 (v - B u)
         for tries in range(1 + REFINEMENTS):
+            if best[1].max() <= ENOUGH:
+                break
             target = scaled.v + price * (1 / scaled.mild**2 - 1)
             z = self._once(scaled, target)
             if z is None:
                 break
             price = scaled.mild**2 * (target - scaled.A @ z)
-            u = np.clip(z / scaled.size, lower, upper)
-            # two proofs: the price that the refinement has built up, and W^2 times what is missed, sharper where much is missed
-            kkt = min(
-                (residuals(matrix, v, u, lower=lower, upper=upper, axis=W, effector=b, preferred=self.preferred, price=y)
-                 for y in (price * scaled.unit * W, None)), key=lambda r: float(r.max()),
-            )  # fmt: skip
-            gained = best is None or kkt.max() < 0.5 * best[1].max()
-            if best is None or kkt.max() < best[1].max():
-                best = (u, kkt)
-            if kkt.max() <= 1e-10 or not (gained or tries < FEWEST):
+            found = judged(z, price)
+            gained = found[1].max() < 0.5 * best[1].max()
+            best = min(best, found, key=lambda one: float(one[1].max()))
+            if not (gained or tries < FEWEST):
                 break
-        if best is None:
-            u = np.clip(self.preferred, lower, upper)
-            return u, np.full(3, np.inf)
         return best
 
     def _once(self, s: _Scaled, target: Array) -> Array | None:

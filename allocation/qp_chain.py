@@ -55,16 +55,20 @@ EXPORT void rw_chain(const double *const *arg, const i64 *stride, const double *
       }}
       {ending}(x, found);
       M good = rw_good(found + {n} + {m});
-      open = on & ~good;
-      for (i64 t = 0; t < {rounds} && __builtin_expect(lane_any(open), 0); t++) {{
-        for (i64 k = 0; k < {m}; k++) x[{total} + k] = start[k];
-        {step}(x, other);
-        M settled = other[{m}] != 0.0;
-        for (i64 k = 0; k < {m}; k++) x[{total} + k] = start[k] = lane_choose(open, other[k], start[k]);
-        {ending}(x, other);
-        for (i64 k = 0; k < {n} + {m} + 3; k++) found[k] = lane_choose(open, other[k], found[k]);
-        good = rw_good(found + {n} + {m});
-        open &= ~(good | settled);
+      for (int again = 0; again < 2; again++) {{  // the second time from zero: what is met exactly by nothing at all is met from there
+        open = on & ~good;
+        if (__builtin_expect(!lane_any(open), 1)) break;
+        if (again) for (i64 k = 0; k < {m}; k++) start[k] = lane_choose(open, lane_all(0.0), start[k]);
+        for (i64 t = 0; t < {rounds} && lane_any(open); t++) {{
+          for (i64 k = 0; k < {m}; k++) x[{total} + k] = start[k];
+          {step}(x, other);
+          M settled = other[{m}] != 0.0;
+          for (i64 k = 0; k < {m}; k++) x[{total} + k] = start[k] = lane_choose(open, other[k], start[k]);
+          {ending}(x, other);
+          for (i64 k = 0; k < {n} + {m} + 3; k++) found[k] = lane_choose(open, other[k], found[k]);
+          good = rw_good(found + {n} + {m});
+          open &= ~(good | settled);
+        }}
       }}
       for (i64 k = 0; k < {m}; k++) {{
         before[k] = s ? now[k] : found[{n} + k];
@@ -89,7 +93,7 @@ class Chain:
     """Solver of N problems in chains; make it with :func:`make`.
 
     The first try of a problem begins at the prices that the two problems before it lead to in a straight line, and mostly ends
-    there; the others go on from the prices of the problem before by steps with a line search.
+    there; the others go on from the prices of the problem before by steps with a line search, and at last from zero.
     """
 
     step: ca.Function
@@ -116,6 +120,7 @@ class Chain:
         native.in_threads(
             lambda first, last: entry(arg, stride, start, *outputs, ctypes.c_longlong(rows), ctypes.c_longlong(length)),
             -(-rows // length), self.lanes, self.threads, vectors_each=1,
+            keep=(self.library, values, given, u, prices, kkt, solved, taken),
         )  # fmt: skip
         return u, prices, kkt, solved
 
@@ -152,16 +157,19 @@ def _interpreted(step: ca.Function, ending: ca.Function, columns: list[Array], r
             now = before = settled(step, data, now)
         start = now if y is None else y[at].copy()
         found = evaluate(ending, *data, now + (now - before) if y is None else start)
-        open_ = np.flatnonzero(~good(found[2]))
-        for _ in range(ROUNDS):
-            if not open_.size:
-                break
-            part = pick(data, open_)
-            start[open_], done = evaluate(step, *part, start[open_])
-            again = evaluate(ending, *part, start[open_])
-            for whole, new in zip(found, again, strict=True):
-                whole[open_] = new
-            open_ = open_[~good(again[2]) & (done[:, 0] == 0)]
+        for again in (False, True):  # the second time from zero
+            open_ = np.flatnonzero(~good(found[2]))
+            if again:
+                start[open_] = 0.0
+            for _ in range(ROUNDS):
+                if not open_.size:
+                    break
+                part = pick(data, open_)
+                start[open_], done = evaluate(step, *part, start[open_])
+                answers = evaluate(ending, *part, start[open_])
+                for whole, new in zip(found, answers, strict=True):
+                    whole[open_] = new
+                open_ = open_[~good(answers[2]) & (done[:, 0] == 0)]
         u[at], prices[at], kkt[at], solved[at] = *found, good(found[2])
         now, before = found[1], now if s else found[1]
     return u, prices, kkt, solved

@@ -67,9 +67,9 @@ def solve_many(
         A shape that does not fit, NaN, a weight that is not positive, crossed limits.
     """
     columns = _columns(B, demand, lower, upper, axis_weight, effector_weight, preferred)
-    N, m, n = len(demand), demand.shape[1], B.shape[-1]
+    N, m, n = _sizes(columns)
     kit = _kit(m, n, N >= WORTH_COMPILING if compiled is None else compiled)
-    return _solve(kit, columns, N, None if y is None else as_finite("solve_many: y", y).reshape(N, m))
+    return _solve(kit, columns, N, None if y is None else _prices("solve_many", y, (N, m)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,21 +94,21 @@ class FixedSolver:
         values = np.ascontiguousarray(as_finite("fixed solver: demand", demand))
         if values.ndim != 2 or values.shape[1] != self.m or not values.size:
             raise ModelError(f"fixed solver: demand has shape {np.shape(demand)}, expected (N, {self.m})")
-        start = None if y is None else as_finite("fixed solver: y", y).reshape(values.shape)
-        return _solve(self.kit, [values], len(values), start)
+        return _solve(self.kit, [values], len(values), None if y is None else _prices("fixed solver", y, values.shape))
 
 
 def fixed(
     B: Array, *, lower: Array, upper: Array, axis_weight: Array, effector_weight: Array, preferred: Array, compiled: bool = True
 ) -> FixedSolver:
     """A solver for one B, limits and weights; arguments as for :func:`solve_many` without the leading axis."""
-    data = _columns(B, np.zeros((1, np.shape(B)[0])), lower, upper, axis_weight, effector_weight, preferred)
-    if any(c.ndim != 1 for c in (data[0], *data[2:])):
-        raise ModelError("fixed: B, limits and weights must be those of one problem, without a leading axis")
-    m, n = np.shape(B)
-    given = active_set.constants(
-        np.asarray(B, dtype=float), lower=data[2], upper=data[3], axis_weight=data[4], effector_weight=data[5], preferred=data[6]
-    )
+    matrix = as_finite("fixed: B", B)
+    if matrix.ndim != 2 or not matrix.size:
+        raise ModelError(f"fixed: B has shape {matrix.shape}, expected (m, n)")
+    m, n = matrix.shape
+    data = _columns(matrix, np.zeros((1, m)), lower, upper, axis_weight, effector_weight, preferred)
+    if any(c.ndim != 1 for c in data[2:]):
+        raise ModelError("fixed: limits and weights must be those of one problem, without a leading axis")
+    given = active_set.constants(matrix, lower=data[2], upper=data[3], axis_weight=data[4], effector_weight=data[5], preferred=data[6])
     return FixedSolver(m, n, _make_kit(given, compiled))
 
 
@@ -142,7 +142,7 @@ def solve_history(
     the steps in it do not solve is solved alone, with exact line searches, and the chain goes on behind it.
     """
     columns = _columns(B, demand, lower, upper, axis_weight, effector_weight, preferred)
-    N, m, n = len(demand), demand.shape[1], B.shape[-1]
+    N, m, n = _sizes(columns)
     native_wanted = N >= LONG if compiled is None else compiled
     chain, kit = _chain(m, n, native_wanted), _kit(m, n, native_wanted)
     before = as_finite("solve_history: start", start)
@@ -188,7 +188,7 @@ def _chain(m: int, n: int, compiled: bool) -> Call:
     once = ca.Function.if_else("wls_once", newton, as_it_is)
     carry, row, room = ca.MX.sym("carry", n + m), ca.MX.sym("row", sum(c.numel() for c in given[0])), ca.MX.sym("room", n)
     data = ca.vertsplit(row, list(np.cumsum([0, *(c.numel() for c in given[0])])))
-    before, y = carry[:n], active_set.usable(carry[n:])
+    before, y = carry[:n], active_set.beginning(data[1], carry[n:])
     data[2], data[3] = (
         ca.fmin(ca.fmax(data[2], before - room), before + room), ca.fmax(ca.fmin(data[3], before + room), before - room)
     )  # fmt: skip
@@ -214,10 +214,21 @@ class _Kit:
     ending: ca.Function
 
     def anew(self, columns: list[Array], rows: int) -> tuple[Array, Array, Array]:
-        """u, y, kkt from the beginning, with exact line searches."""
-        y = qp_chain.settled(self.thorough, columns, np.zeros((rows, self.ending.size1_out(1))))
-        u, y, kkt = evaluate(self.ending, *columns, y)
-        return u, y, kkt
+        """u, y, kkt from the beginning, with exact line searches; the best of all steps."""
+        y = np.zeros((rows, self.ending.size1_out(1)))
+        best = list(evaluate(self.ending, *columns, y))
+        left = np.arange(rows)
+        for _ in range(qp_chain.ROUNDS):
+            data = qp_chain.pick(columns, left)
+            y[left], settled = evaluate(self.thorough, *data, y[left])
+            found = evaluate(self.ending, *data, y[left])
+            better = found[2].max(axis=1) < best[2][left].max(axis=1)
+            for whole, new in zip(best, found, strict=True):
+                whole[left[better]] = new[better]
+            left = left[(settled[:, 0] == 0) & ~qp_chain.good(best[2][left])]
+            if not left.size:
+                break
+        return best[0], best[1], best[2]
 
 
 @lru_cache(maxsize=32)
@@ -251,3 +262,17 @@ def _columns(*values: Array) -> list[Array]:
     if (data[2] > data[3]).any():
         raise ModelError("solve_many: a lower limit is above its upper limit; correct the limits")
     return [np.ascontiguousarray(np.swapaxes(B, -1, -2)).reshape(*B.shape[:-2], m * n), *data[1:]]
+
+
+def _sizes(columns: list[Array]) -> tuple[int, int, int]:
+    """N, m, n of problem data."""
+    N, m = columns[1].shape
+    return N, m, columns[0].shape[-1] // m
+
+
+def _prices(what: str, y: Array, shape: tuple[int, ...]) -> Array:
+    """Checked warm start."""
+    values = as_finite(f"{what}: y", y)
+    if values.shape != shape:
+        raise ModelError(f"{what}: y has shape {values.shape}, expected {shape}: one row of prices for each demand")
+    return values

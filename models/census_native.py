@@ -193,7 +193,8 @@ def _compiled(kernel: Library, rows: Array) -> Words:
     entry = kernel.entry("rw_census")
     given = [native.address(a) for a in (rows, limits, outcome, cycles, periods, symbols)]
     native.in_threads(lambda first, last: entry(*given, ctypes.c_longlong(first), ctypes.c_longlong(last)),
-                      count, 16, native.processors(), vectors_each=1)  # fmt: skip
+                      count, 16, native.processors(), vectors_each=1,
+                      keep=(kernel, rows, limits, outcome, cycles, periods, symbols))  # fmt: skip
     cycles[outcome == OVERFLOW] = 0
     chosen = np.arange(CYCLES) < cycles[:, None]
     point, _ = np.nonzero(chosen)

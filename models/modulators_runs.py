@@ -214,7 +214,8 @@ def _advance(
     given += [ctypes.c_longlong(steps), native.address(y), native.address(z), native.address(total)]
     workers = native.options(kind.kernel(), "auto", threads or "auto", "accurate")
     native.in_threads(lambda first, last: entry(*given, ctypes.c_longlong(first), ctypes.c_longlong(last)),
-                      runs, lanes, workers, vectors_each=1 if steps > 1000 else 64)  # fmt: skip
+                      runs, lanes, workers, vectors_each=1 if steps > 1000 else 64,
+                      keep=(library, state, demand, p, y, z, total))  # fmt: skip
     return y, z, bool(np.isfinite(total).all()), backend
 
 

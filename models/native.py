@@ -5,9 +5,10 @@ from __future__ import annotations
 import ctypes
 import itertools
 import os
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import lru_cache
@@ -127,7 +128,7 @@ class Native:
         arg, stride, res = pointers(values), strides(values), pointers(flat)
         entry = self.library.entry("rw_run")
         in_threads(lambda first, last: entry(arg, stride, res, address(mask), ctypes.c_longlong(first), ctypes.c_longlong(last)),
-                   rows, self.lanes, self.threads)  # fmt: skip
+                   rows, self.lanes, self.threads, keep=(self.library, values, flat, mask))  # fmt: skip
         outputs = []
         for o, out in enumerate(flat):
             a, b = f.size_out(o)
@@ -285,18 +286,58 @@ def shared_by(tasks: int) -> Iterator[None]:
         _MOST_THREADS.reset(before)
 
 
-def in_threads(run: Callable[[int, int], None], rows: int, lanes: int, threads: int, *, vectors_each: int = WORTH_A_THREAD) -> None:
-    """Call ``run(first, last)`` for fixed parts of the rows, each a whole number of vectors, at once where it pays."""
+def in_threads(
+    run: Callable[[int, int], None], rows: int, lanes: int, threads: int, *, keep: Sequence[object], vectors_each: int = WORTH_A_THREAD
+) -> None:
+    """Call ``run(first, last)`` for fixed parts of the rows, each a whole number of vectors, at once where it pays.
+
+    Parameters
+    ----------
+    run : callable
+    rows, lanes, threads : int
+    keep : sequence
+        Arrays and libraries that `run` uses by their addresses: they live as long as any thread works with them.
+    vectors_each : int
+        Vectors that are worth a thread.
+    """
     vectors, most = -(-rows // lanes), _MOST_THREADS.get()
     parts = max(1, min(threads, vectors // vectors_each, threads if most is None else most))
     edges = [min(rows, lanes * (vectors * k // parts)) for k in range(parts)] + [rows]
-    others = [_pool().submit(run, first, last) for first, last in itertools.pairwise(edges[1:])]
+    todo = deque(itertools.pairwise(edges))
+
+    def work(used: Sequence[object] = keep) -> None:
+        while todo:
+            try:
+                part = todo.popleft()
+            except IndexError:  # another thread was faster
+                return
+            run(*part)
+
+    others: list[Future[None]] = []
     try:
-        run(0, edges[1])
+        with suppress(RuntimeError):  # no more threads, or the interpreter is about to end: this thread does what is left
+            for _ in range(parts - 1):
+                others.append(_pool().submit(work))
+        work()
     finally:
-        wait(others)  # whatever happens: they write into arrays of the caller
+        todo.clear()
+        _wait([other for other in others if not other.cancel()])
     for other in others:
-        other.result()
+        if not other.cancelled():
+            other.result()
+
+
+def _wait(running: Sequence[Future[None]]) -> None:
+    """Wait to the end even if interrupted: they write into arrays of the caller."""
+    interrupted: BaseException | None = None
+    while running:
+        try:
+            wait(running)
+            break
+        except BaseException as error:
+            interrupted = error
+    if interrupted is not None:
+        raise interrupted
 
 
 @lru_cache(maxsize=1)

@@ -215,7 +215,10 @@ class NativeLoop:
         given: list[Any] = [native.address(a) for a in values]
         given += [ctypes.c_longlong(len(values[1])), *(native.address(a) for a in (before, after, fraction, index, outcome, taken))]
         # each thread takes the next vector of cases until none is left: a busy processor then holds up nobody
-        native.in_threads(lambda first, last: entry(*given, ctypes.c_longlong(cases)), cases, self.lanes, self.threads, vectors_each=1)
+        native.in_threads(
+            lambda first, last: entry(*given, ctypes.c_longlong(cases)), cases, self.lanes, self.threads, vectors_each=1,
+            keep=(self.library, values, before, after, fraction, index, outcome, taken),
+        )  # fmt: skip
         return Ends(before, after, index, outcome.astype(np.int64), fraction)
 
 

@@ -8,6 +8,7 @@ from scipy.optimize import lsq_linear
 
 from allocation import active_set, qp_chain, qp_native
 from models import native
+from models.checked import ModelError, evaluate
 
 M, N = 2, 5
 ROWS = 1499  # neither a whole number of chains nor of vectors
@@ -107,3 +108,56 @@ def test_what_the_chains_leave_is_solved_from_the_beginning(use_compiler, monkey
     found = hasty(demand)
     assert found.solved.all()
     assert found.u == pytest.approx(right.u, abs=1e-10)
+
+
+@pytest.mark.parametrize("use_compiler", [False, True])
+@pytest.mark.parametrize("every", [2, 25])
+def test_demands_of_zero_are_met_in_the_chain(use_compiler, every, monkeypatch):
+    """Nothing but exact zeros proves them, and their neighbours do not lead there."""
+    if use_compiler and not native.native_available():
+        pytest.skip("no C compiler on this machine")
+    rng = np.random.default_rng(0)
+    B, t = rng.normal(size=(3, 10)), np.arange(1200)
+    demand = np.sin(t[:, None] / 40 + [0.0, 1.0, 2.0]) * 0.6 * np.abs(B).sum(axis=1)
+    demand[(t // every) % 2 == 1] = 0.0
+    data = {"axis_weight": np.ones(3), "effector_weight": np.full(10, 3e-4), "preferred": np.zeros(10)}
+    alone = []
+    anew = qp_native._Kit.anew
+    monkeypatch.setattr(qp_native._Kit, "anew", lambda kit, columns, rows: alone.append(rows) or anew(kit, columns, rows))
+    found = qp_native.solve_many(B, demand, lower=-np.ones(10), upper=np.ones(10), **data, compiled=use_compiler)
+    assert found.solved.all()
+    assert np.abs(found.u[(demand == 0).all(axis=1)]).max() == 0
+    assert alone == []
+    history = qp_native.solve_history(
+        B, demand[:200], lower=-np.ones(10), upper=np.ones(10), **data, room=np.full(10, np.inf), start=np.zeros(10)
+    )
+    assert history.solved.all()
+    assert alone == []
+
+
+def test_the_best_of_all_steps_counts():
+    """With weights twelve decades apart the last step can be worse than one before it."""
+    rng = np.random.default_rng(0)
+    count, kit = 5000, qp_native._kit(2, 2, False)
+    B = np.abs(rng.normal(size=(count, 2, 2))) * np.sign(rng.normal(size=(count, 1, 2)))
+    W, b = 10 ** rng.uniform(-2, 2, (count, 2)), 10 ** rng.uniform(-8, 0, (count, 2))
+    demand = rng.normal(size=(count, 2)) * np.abs(B).sum(axis=2) * 10 ** rng.uniform(-3, 0, (count, 1))
+    columns = columns_of(B, demand, np.zeros((count, 2)), rng.random((count, 2)), W, b, np.zeros((count, 2)))
+    y = qp_chain.settled(kit.thorough, columns, np.zeros((count, 2)))
+    last, best = evaluate(kit.ending, *columns, y)[2], kit.anew(columns, count)[2]
+    assert (best.max(axis=1) <= np.maximum(last.max(axis=1), 1e-9)).all()
+    assert (qp_chain.good(best) & ~qp_chain.good(last)).any()
+
+
+def test_wrong_warm_starts_are_refused():
+    B, demand, lower, upper, W, b, p = walk(20)
+    data = {"lower": lower, "upper": upper, "axis_weight": W, "effector_weight": b, "preferred": p}
+    solver = qp_native.fixed(B, **data, compiled=False)
+    for y in (np.zeros((M, 20)), np.zeros(20 * M), np.zeros((19, M))):
+        with pytest.raises(ModelError, match=r"y has shape .* expected \(20, 2\)"):
+            qp_native.solve_many(B, demand, **data, y=y)
+        with pytest.raises(ModelError, match=r"y has shape .* expected \(20, 2\)"):
+            solver(demand, y)
+    with pytest.raises(ModelError, match="B has shape"):
+        qp_native.fixed(3.0, **data)
+    assert qp_native.solve_many(B.tolist(), demand.tolist(), **data).solved.all()

@@ -248,7 +248,7 @@ def test_tasks_that_share_the_processors_take_their_part(monkeypatch):
 
     def parts(threads=6, rows=1000):
         seen = []
-        native.in_threads(lambda first, last: seen.append((first, last)), rows, 4, threads, vectors_each=1)
+        native.in_threads(lambda first, last: seen.append((first, last)), rows, 4, threads, keep=(), vectors_each=1)
         seen.sort()
         assert seen[0][0] == 0
         assert seen[-1][1] == rows

@@ -71,14 +71,14 @@ def compiled_by_this_worker(folder: str, text: str, drawn: Any, native: Any, cod
         in_threads = compiled.in_threads
         parts: list[int] = []
 
-        def counted(run: Any, rows: int, lanes: int, threads: int, *, vectors_each: int = 1) -> None:
+        def counted(run: Any, rows: int, lanes: int, threads: int, *, keep: Any, vectors_each: int = 1) -> None:
             ran: list[int] = []
 
             def part(first: int, last: int) -> None:
                 ran.append(first)
                 run(first, last)
 
-            in_threads(part, rows, 1, 8, vectors_each=1)  # as many as are allowed
+            in_threads(part, rows, 1, 8, keep=keep, vectors_each=1)  # as many as are allowed
             parts.append(len(ran))
 
         setattr(compiled, "counted", parts)  # noqa: B010 (kept between the chunks of one worker)
