@@ -3,8 +3,9 @@
 from allocation.attainable import AttainableSet, attainable_set
 from allocation.blending import Handover
 from allocation.bound import on_off
-from allocation.compare import Comparison, History, Method, user_method
+from allocation.compare import Comparison, Method, user_method
 from allocation.core import Allocation, Effectors
+from allocation.demand_history import History
 from allocation.predictive import Tradeoff, planner, receding_horizon
 from allocation.pseudo_inverse import daisy_chain, redistributed, weighted
 from allocation.qp import Weights, allocate, blend, history, weights_for

@@ -95,8 +95,8 @@ class AttainableSet:
                 x, y = points[:, names.index(a)], points[:, names.index(b)]
                 ax.plot(x[inside], y[inside], ".", ms=4, label="demand inside")
                 ax.plot(x[~inside], y[~inside], "x", ms=5, label="demand outside")
-            ax.set_xlabel(a)
-            ax.set_ylabel(b)
+            ax.set_xlabel(self.effectors.label(a))
+            ax.set_ylabel(self.effectors.label(b))
             ax.locator_params(nbins=5)
             ax.ticklabel_format(scilimits=(-3, 4))
             if i == 0:

@@ -3,140 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from allocation.core import Effectors
-from allocation.qp import Weights, weights_for
+from allocation.demand_history import History
 from allocation.qp_native import within
-from models.checked import Array, ModelError, as_finite, as_scalar, frozen
+from models.checked import Array, ModelError, as_finite, frozen
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Step = Callable[[Effectors, Array, Array], Array]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class History:
-    """What was asked for over time, and what the effectors could do then.
-
-    Attributes
-    ----------
-    effectors : Effectors
-        Names, axes, rates, flows; B and limits where they do not change.
-    dt : float
-        Sample time, s.
-    demand : ndarray, shape (N, m)
-    B : ndarray, shape (N, m, n), optional
-    lower, upper : ndarray, shape (N, n), optional
-    context : mapping of str to ndarray (N,)
-        What else a method may need, such as qbar.
-    weights : ndarray, shapes (N, m), (N, n), optional
-        Weights of axes and effectors for each sample; otherwise ``weights_for(effectors)`` for all.
-    name : str
-    """
-
-    effectors: Effectors
-    dt: float
-    demand: Array
-    B: Array | None = None
-    lower: Array | None = None
-    upper: Array | None = None
-    context: Mapping[str, Array] = field(default_factory=dict)
-    axis_weight: Array | None = None
-    effector_weight: Array | None = None
-    name: str = "demand"
-
-    def __post_init__(self) -> None:
-        m, n = self.effectors.B.shape
-        demand = self.effectors.demands(self.demand)
-        if demand.ndim != 2:
-            raise ModelError(f"history {self.name}: demand has shape {demand.shape}, expected (N, {m})")
-        if as_scalar(f"history {self.name}: dt", self.dt) <= 0:
-            raise ModelError(f"history {self.name}: dt must be > 0 s, got {self.dt}")
-        N = len(demand)
-        object.__setattr__(self, "demand", frozen(demand))
-        shapes = {"B": (N, m, n), "lower": (N, n), "upper": (N, n), "axis_weight": (N, m), "effector_weight": (N, n)}
-        for what, shape in shapes.items():
-            given = getattr(self, what)
-            if given is None:
-                continue
-            values = as_finite(f"history {self.name}: {what}", given)
-            if values.shape != shape:
-                raise ModelError(f"history {self.name}: {what} has shape {values.shape}, expected {shape}")
-            object.__setattr__(self, what, frozen(values))
-        for key, column in self.context.items():
-            if np.shape(column) != (N,):
-                raise ModelError(f"history {self.name}: context {key} has shape {np.shape(column)}, expected ({N},)")
-
-    def __len__(self) -> int:
-        return len(self.demand)
-
-    def __repr__(self) -> str:
-        e = self.effectors
-        return f"History({self.name!r}: {len(self)} samples of {self.dt:g} s, axes {e.axes}, {len(e.names)} effectors)"
-
-    @property
-    def t(self) -> Array:
-        """Times of the samples, s."""
-        return np.asarray(self.dt * np.arange(len(self)), dtype=float)
-
-    def at(self, k: int) -> Effectors:
-        """The effectors at sample k."""
-        if self.B is None and self.lower is None and self.upper is None:
-            return self.effectors
-        e = self.effectors
-        return replace(
-            e, B=e.B if self.B is None else self.B[k], lower=e.lower if self.lower is None else self.lower[k],
-            upper=e.upper if self.upper is None else self.upper[k],
-        )  # fmt: skip
-
-    def failed(self, names: Iterable[str] | Mapping[str, float | None]) -> History:
-        """The same history with effectors out of order; see :meth:`allocation.core.Effectors.failed`."""
-        broken = self.effectors.failed(names)
-        gone = [self.effectors.index(name) for name in names]
-
-        def held(values: Array | None, limits: Array) -> Array | None:
-            if values is None:
-                return None
-            changed = values.copy()
-            changed[:, gone] = limits[gone]
-            return changed
-
-        return replace(self, effectors=broken, lower=held(self.lower, broken.lower), upper=held(self.upper, broken.upper))
-
-    def part(self, rows: np.ndarray | slice) -> History:
-        """Some of the samples; rates between samples that were not neighbours lose their meaning."""
-
-        def pick(values: Array | None) -> Array | None:
-            return None if values is None else values[rows]
-
-        return replace(
-            self, demand=self.demand[rows], B=pick(self.B), lower=pick(self.lower), upper=pick(self.upper),
-            context={k: v[rows] for k, v in self.context.items()}, axis_weight=pick(self.axis_weight),
-            effector_weight=pick(self.effector_weight),
-        )  # fmt: skip
-
-    def weighted(
-        self, *, priority: Mapping[str, float] | None = None, cost: Mapping[str, float] | None = None, ratio: float = 3e-4
-    ) -> History:
-        """The same history with weights from :func:`allocation.qp.weights_for` at each sample; the effectors' own limits set the scale."""
-        if self.B is None:
-            w = weights_for(self.effectors, priority=priority, cost=cost, ratio=ratio)
-            rows = len(self)
-            return replace(self, axis_weight=np.tile(w.axis, (rows, 1)), effector_weight=np.tile(w.effector, (rows, 1)))
-        each = [weights_for(replace(self.effectors, B=B), priority=priority, cost=cost, ratio=ratio) for B in self.B]
-        return replace(self, axis_weight=np.array([w.axis for w in each]), effector_weight=np.array([w.effector for w in each]))
-
-    def weights_at(self, k: int) -> Weights:
-        """Weights at sample k."""
-        if self.axis_weight is None or self.effector_weight is None:
-            return weights_for(self.effectors)
-        return Weights(self.axis_weight[k], self.effector_weight[k], np.zeros(len(self.effectors.names)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -313,15 +194,16 @@ class Comparison:
         from models.drawing import new_figure
 
         whole = [o for o in self.outcomes if len(o.samples) == len(self.history) and (methods is None or o.name in methods)]
-        axes = self.history.effectors.axes
+        effectors = self.history.effectors
+        axes = effectors.axes
         figure = new_figure(9.0, 2.2 + 2.0 * len(axes) * 2)
         panels = figure.subplots(2 * len(axes), 1, sharex=True, squeeze=False)[:, 0]
         for i, axis in enumerate(axes):
             panels[2 * i].plot(self.history.t, self.history.demand[:, i], "k", lw=1, label="demand")
-            panels[2 * i].set_ylabel(f"{axis} demand")
+            panels[2 * i].set_ylabel(effectors.label(f"{axis} demand"))
             for o in whole:
                 panels[2 * i + 1].plot(self.history.t, o.residual[:, i], lw=1, label=o.name)
-            panels[2 * i + 1].set_ylabel(f"{axis} unmet")
+            panels[2 * i + 1].set_ylabel(effectors.label(f"{axis} unmet"))
             if i == 0:
                 panels[1].legend(fontsize="small", ncols=3)
         panels[-1].set_xlabel("t [s]")
@@ -343,7 +225,9 @@ def compare(history: History, methods: Sequence[Method]) -> Comparison:
         No methods, two of one name, commands that are not finite or of a wrong shape.
     """
     names = [method.name for method in methods]
-    if not names or len(set(names)) != len(names):
+    if not names:
+        raise ModelError("compare: got no methods, expected at least one")
+    if len(set(names)) != len(names):
         raise ModelError(f"compare: expected methods of different names, got {names}")
     outcomes = tuple(_outcome(history, method, method.most) for method in methods)
     fewest = min(outcomes, key=lambda o: len(o.samples)).samples

@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike
 
 from models.checked import Array, ModelError, Status, as_finite, as_scalar, frozen, unknown_name
 
+WRITTEN = 1e-5  # of the range: a jammed command this far beyond a limit is the limit, written with few digits
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Effectors:
@@ -29,6 +31,8 @@ class Effectors:
         Names of the rows.
     flow : ndarray, shape (n,)
         Propellant at u = 1, kg/s; 0 (default) for what burns none.  Effectors with a flow are jets: on or off, in pulses.
+    unit : str
+        Of the wrench, such as "N m", for the labels of figures; empty (default) where nobody knows it.
 
     Raises
     ------
@@ -43,6 +47,7 @@ class Effectors:
     rate: Array = field(default_factory=lambda: np.array(np.inf))
     axes: tuple[str, ...] = ()
     flow: Array = field(default_factory=lambda: np.array(0.0))
+    unit: str = ""
 
     def __post_init__(self) -> None:
         names = tuple(str(name) for name in self.names)
@@ -82,6 +87,15 @@ class Effectors:
             raise ModelError(f"effectors: {what} has shape {raw.shape}, expected ({n},): one value for each effector")
         return frozen(raw)
 
+    def __repr__(self) -> str:
+        first = ", ".join(self.names[:3]) + (", ..." if len(self.names) > 3 else "")
+        axes = ", ".join(self.axes) + (f" in {self.unit}" if self.unit else "")
+        return f"Effectors({len(self.names)}: {first}; {int(self.jets.sum())} jets; axes {axes})"
+
+    def label(self, text: str) -> str:
+        """Text of a figure's axis on which a wrench stands, with its unit if there is one."""
+        return f"{text} [{self.unit}]" if self.unit else text
+
     def index(self, name: str) -> int:
         """Column of an effector."""
         if name not in self.names:
@@ -101,14 +115,27 @@ class Effectors:
         names : names, or mapping name -> value
             Jammed where the mapping says (a surface stuck at 0.1 rad still acts); names alone (or None) stop at 0, or at the limit
             nearest to 0.
+
+        Raises
+        ------
+        ModelError
+            An unknown name; a value beyond the limits of its effector, where it cannot have stopped.
         """
         values: dict[str, float | None] = dict(names) if isinstance(names, Mapping) else dict.fromkeys(names)
         lower, upper = self.lower.copy(), self.upper.copy()
         for name, value in values.items():
             i = self.index(name)
-            rest = min(max(0.0, lower[i]), upper[i]) if value is None else as_scalar(f"effectors: failed: {name}", value)
-            lower[i] = upper[i] = rest
+            lower[i] = upper[i] = min(max(0.0, lower[i]), upper[i]) if value is None else self._jammed(i, value)
         return replace(self, lower=lower, upper=upper)
+
+    def _jammed(self, i: int, value: float) -> float:
+        name, low, high = self.names[i], float(self.lower[i]), float(self.upper[i])
+        found = as_scalar(f"effectors: failed: {name}", value)
+        slack = WRITTEN * (high - low)
+        if not low - slack <= found <= high + slack:
+            hint = "duty from 0 (off) to 1 (always on)" if self.jets[i] else "angles are in radians: did you give degrees?"
+            raise ModelError(f"effectors: failed: {name}: found {found:.6g}, expected a value from {low:.6g} to {high:.6g}; {hint}")
+        return min(max(found, low), high)
 
     def within_reach(self, previous: ArrayLike, dt: float) -> Effectors:
         """The same effectors with the limits that the rates leave for the next dt (s) after the commands `previous` (n,)."""

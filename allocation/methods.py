@@ -9,9 +9,12 @@ from dataclasses import replace
 import numpy as np
 
 from allocation import backends, blending, bound, predictive, pseudo_inverse, qp_native
-from allocation.compare import Answers, History, Method, stepwise
+from allocation.compare import Answers, Method, stepwise
 from allocation.core import Effectors
+from allocation.demand_history import History
 from models.checked import Array, ModelError
+
+BOUND = "on-off bound (MILP)"
 
 
 def own(name: str = "QP (own)") -> Method:
@@ -156,18 +159,35 @@ def _moving_horizon(history: History, tradeoff: predictive.Tradeoff) -> Answers:
     return stepwise(history, step, "predictive")
 
 
-def on_off_bound(*, most: int = 100, time_limit: float = 1.0, shortest: float = 1.0) -> Method:
-    """What jets that are on or off could do at best, by a mixed-integer program, on `most` samples."""
+def on_off_bound(*, most: int = 100, time_limit: float = 1.0, shortest: float = 1.0, opposed: bool = False) -> Method:
+    """What jets that are on or off for each cycle by itself could do at best, by a mixed-integer program, on `most` samples.
+
+    Each effector with a flow is one switch, so a group of jets fires whole.  Cycles know nothing of each other: nothing fires for a
+    demand of less than half of what one switch gives, however long it lasts.
+
+    Parameters
+    ----------
+    most : int
+        Samples that it is asked for.
+    time_limit : float
+        s, for each sample.
+    shortest : float
+        Shortest pulse, in parts of the cycle; 1: on or off for the whole cycle.
+    opposed : bool
+        Let jets fire against each other; see :func:`allocation.bound.on_off`.
+    """
 
     def answer(history: History) -> Answers:
         def step(k: int, effectors: Effectors, demand: Array, previous: Array) -> tuple[Array, Array | None, bool]:
-            found = bound.on_off(effectors, demand, weights=history.weights_at(k), shortest=shortest, time_limit=time_limit)
+            found = bound.on_off(
+                effectors, demand, weights=history.weights_at(k), shortest=shortest, opposed=opposed, time_limit=time_limit
+            )
             return found.allocation.u, None, found.allocation.ok
 
         free = replace(history, effectors=replace(history.effectors, rate=np.inf))  # type: ignore[arg-type]
         return stepwise(free, step, "on-off bound")
 
-    return Method("on-off bound (MILP)", answer, most)
+    return Method(BOUND, answer, most)
 
 
 def standard(*, solvers: Sequence[str] | None = None, slow: int = 200, bound_samples: int = 100) -> list[Method]:

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from allocation import attainable, backends, blending, methods
-from allocation.compare import COLUMNS, Comparison, History, Method, compare
+from allocation.compare import COLUMNS, Comparison, Method, compare
 from allocation.core import Effectors
+from allocation.demand_history import History
 from models.checked import ModelError, evaluate, unknown_name
 from models.shuttle_aero import orbiter_aero, orbiter_data
 from models.thrusters import ThrusterSet, elevons_and_flap, orbiter_jets
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 COST_ELEVON, COST_JETS = 3e-8, 3e-4  # a and b of the quadratic program beside the weight 1 of the error, on moments
 ARM = 0.25  # distance of the centre of one elevon's force from the plane of symmetry, in spans (estimated)
 AFT = "LR"  # pods that fire in entry: the forward jets are shut
+BEYOND = 1.25  # size of the demands on three axes: some of them cannot be met
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +65,7 @@ def pitch_history(flight: Flight, *, handover: blending.Handover | None = None, 
     B = np.stack([slope, np.full_like(slope, up), np.full_like(slope, down)], axis=1)[:, None, :]
     effectors = Effectors(
         ("elevon", "jets_up", "jets_down"), B[0], np.array([h.lower, 0.0, 0.0]), np.array([h.upper, 1.0, 1.0]), axes=("M",),
-        flow=np.array([0.0, jets.flow_up, jets.flow_down]),
+        flow=np.array([0.0, jets.flow_up, jets.flow_down]), unit="N m",
     )  # fmt: skip
     return History(
         effectors=effectors, dt=float(flight.t[every] - flight.t[0]), demand=(slope * demand)[:, None], B=B,
@@ -110,13 +112,15 @@ def orbiter_effectors(condition: Condition | None = None, *, jets: ThrusterSet |
         (*surfaces.names, *chosen.names), np.hstack([surfaces.moments, chosen.effectiveness()[3:]]),
         np.concatenate([surfaces.lower, np.zeros(n)]), np.concatenate([surfaces.upper, np.ones(n)]),
         rate=np.concatenate([surfaces.rate, np.full(n, np.inf)]), axes=("L", "M", "N"), flow=np.concatenate([np.zeros(3), chosen.flow]),
+        unit="N m",
     )  # fmt: skip
 
 
 def three_axis_history(condition: Condition | None = None, *, samples: int = 1000, seed: int = 7) -> History:
     """Demands in roll, pitch and yaw that wander through the attainable set and a little out of it, 60 ms apart, rates limited.
 
-    Each axis is a sum of four sines of 3 to 20 s with random phases, up to all that the effectors reach on that axis alone.
+    Each axis is a sum of four sines of 3 to 20 s with random phases, up to :data:`BEYOND` times what the effectors reach on that axis
+    alone.  Of the 1000 demands of the usual seed 38 are outside.
     """
     effectors = orbiter_effectors(condition)
     rng = np.random.default_rng(seed)
@@ -124,7 +128,7 @@ def three_axis_history(condition: Condition | None = None, *, samples: int = 100
     periods, phases = rng.uniform(3.0, 20.0, (4, 3)), rng.uniform(0, 2 * np.pi, (4, 3))
     waves = np.sin(2 * np.pi * t[:, None, None] / periods + phases).sum(axis=1) / 4
     size = np.minimum(attainable.attainable_set(effectors).reach(np.eye(3)), attainable.attainable_set(effectors).reach(-np.eye(3)))
-    return History(effectors=effectors, dt=0.06, demand=waves * size, name="three axes").weighted()
+    return History(effectors=effectors, dt=0.06, demand=BEYOND * waves * size, name="three axes").weighted()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,6 +158,13 @@ class AllocationStudy:
             },
             "methods": tables[0], "same_samples": tables[1],
         }  # fmt: skip
+
+    @property
+    def remark(self) -> str:
+        """What a table of the methods has to say about rates; empty where nothing limits them or every method keeps to them."""
+        limited = bool(np.isfinite(self.comparison.history.effectors.rate).any())
+        free = any(outcome.name == methods.BOUND for outcome in self.comparison.outcomes)
+        return "Every method but the on-off bound keeps to the rates of the surfaces." if limited and free else ""
 
     def figures(self) -> dict[str, Figure]:
         """Residuals over time; the attainable set with the demands, where the effectors do not change."""
@@ -197,7 +208,7 @@ def run(
     if priority or cost:
         asked = asked.weighted(priority=priority, cost=cost)
     known = known_methods(asked, slow=slow, bound_samples=bound_samples)
-    picked = []
+    picked: list[Method] = []
     for item in chosen if chosen is not None else known:
         if isinstance(item, Method):
             picked.append(item)

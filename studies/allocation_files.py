@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from allocation.compare import History
 from allocation.core import Effectors
+from allocation.demand_history import History
 from models.checked import Array, ModelError
 
 MAX_BYTES = 200_000_000
@@ -187,4 +187,4 @@ def _demand(grid: Grid, axes: Sequence[str], effectiveness: Path, dt: float | No
         row = int(bad[0]) + 1
         raise grid.error(row, at, f"{steps[row - 1]:g} s after the row before; expected equal steps of {steps[0]:g} s" if steps[0] > 0
                          else "expected increasing times")  # fmt: skip
-    return values, float((times[-1] - times[0]) / (len(times) - 1))
+    return values, float(f"{(times[-1] - times[0]) / (len(times) - 1):.12g}")  # the file says 0.1, not 0.09999999999999999

@@ -70,9 +70,9 @@ def _tables(title: str, study: AllocationStudy) -> list[Table]:
         return [[cell if isinstance(cell, str) else float(cell) for cell in row] for row in study.comparison.rows(same=same)]
 
     note = (
-        "Errors relative to the scale of the demand. Worst KKT residual of the answers, and how many fail the workbench's own check."
-        " Every method but the on-off bound keeps to the rates of the surfaces."
-    )
+        "Errors relative to the scale of the demand. Worst KKT residual of the answers, and how many fail the workbench's own check. "
+        "The on-off bound is of each cycle by itself, and each effector is one switch. " + study.remark
+    ).strip()
     whole = Table(title, COLUMNS, rows(False), f"{note} Slow methods were given a part of the samples: compare them in the next table.")
     same = Table(f"{title}: all methods on the same samples", COLUMNS, rows(True), note)
     return [whole, same]

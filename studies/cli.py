@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from studies import cli_allocate, cli_blend, cli_campaign, cli_jetloop, cli_landing, cli_modulator, console
-from studies.cli_options import AsJson, ShowScenario, out_folder, scenario_changes, scenario_file
+from studies.cli_options import AsJson, ShowScenario, folder_of, out_folder, scenario_changes, scenario_file
 from studies.console import Code, InputError
 
 if TYPE_CHECKING:
@@ -50,7 +50,9 @@ Times = Annotated[
     str | None,
     typer.Option("--at", metavar="TIMES", show_default=False, help='Sample the gains at these times in s, such as "0,50,100".'),
 ]
-ReportFolder = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of the report; an older report there is replaced.")]
+ReportFolder = Annotated[
+    Path, typer.Option("--out", metavar="DIR", parser=folder_of, help="Folder of the report; an older report there is replaced.")
+]
 
 _HEADLINES = (
     ("flight time", "t_f_s", "s"), ("range", "range_m", "m"), ("peak axial load", "peak_axial_g", "g0"),

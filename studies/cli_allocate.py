@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,7 +14,7 @@ from studies.cli_options import AnswerFolder, AsJson
 from studies.console import InputError
 
 if TYPE_CHECKING:
-    from allocation.compare import History
+    from allocation.demand_history import History
     from studies.allocation import AllocationStudy
 
 app = typer.Typer(
@@ -54,7 +55,12 @@ def compare(
     ] = None,
     fail: Annotated[
         list[str] | None,
-        typer.Option("--fail", metavar="NAME[=VALUE]", show_default=False, help="Effector that is off, or jammed at VALUE; repeatable."),
+        typer.Option(
+            "--fail",
+            metavar="NAME[=VALUE]",
+            show_default=False,
+            help="Effector that is off, or jammed at VALUE (surface: rad; jet: duty, 0 to 1); repeatable.",
+        ),
     ] = None,
     priority: Annotated[
         list[str] | None, typer.Option("--priority", metavar="AXIS=FACTOR", show_default=False, help="Weight of an axis; repeatable.")
@@ -69,12 +75,12 @@ def compare(
 ) -> None:
     """Compare allocation methods on one demand history: tracking, propellant, pulses, travel, optimality, time."""
     failed, factors = _failures(fail or []), (_factors("--priority", priority or []), _factors("--cost", cost or []))
+    chosen = None if methods is None else _chosen(methods, bound)
     console.check_out(out)
     with console.work():
         from studies import allocation
 
         history = _history(scenario, effectiveness, limits, demand, dt)
-        chosen = None if methods is None else [part.strip() for part in methods.split(",") if part.strip()]
         study = allocation.run(history, chosen=chosen, failed=failed, priority=factors[0], cost=factors[1], slow=slow, bound_samples=bound)
         data = study.to_dict()
     console.write_answer(out, "allocation", data, figures=study.figures)
@@ -111,22 +117,43 @@ def _history(scenario: str | None, effectiveness: File, limits: File, demand: Fi
     return read_history(effectiveness, limits, demand, dt=dt)
 
 
+def _chosen(text: str, bound: int) -> list[str]:
+    """Names of ``--methods``."""
+    names = [part.strip() for part in text.split(",") if part.strip()]
+    if not names:
+        raise InputError(f"--methods: found {text!r}, expected names such as qp,osqp,redistributed; leave the option out for all of them")
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"--methods: {name} is given twice; give it once")
+    if "bound" in names and bound == 0:
+        raise InputError("--methods names bound, and --bound 0 leaves it out; give it samples, such as --bound 100, or do not name it")
+    return names
+
+
 def _failures(texts: list[str]) -> dict[str, float | None]:
     found: dict[str, float | None] = {}
     for text in texts:
         name, sign, value = text.partition("=")
-        found[name.strip()] = _number("--fail", text, value) if sign else None
+        found[_new("--fail", text, name, found, "NAME or NAME=VALUE")] = _number("--fail", text, value) if sign else None
     return found
 
 
 def _factors(option: str, texts: list[str]) -> dict[str, float]:
-    found = {}
+    found: dict[str, float] = {}
     for text in texts:
         name, sign, value = text.partition("=")
-        if not sign:
-            raise InputError(f"{option}: found {text!r}, expected NAME=FACTOR such as M=10")
-        found[name.strip()] = _number(option, text, value)
+        name = _new(option, text, name if sign else "", found, "NAME=FACTOR such as M=10")
+        found[name] = _number(option, text, value)
     return found
+
+
+def _new(option: str, text: str, name: str, known: Mapping[str, object], expected: str) -> str:
+    """The name without blanks, if it is one and not among the `known`."""
+    if not name.strip():
+        raise InputError(f"{option}: found {text!r}, expected {expected}")
+    if name.strip() in known:
+        raise InputError(f"{option}: {name.strip()} is given twice; give it once")
+    return name.strip()
 
 
 def _number(option: str, text: str, value: str) -> float:
@@ -146,9 +173,10 @@ def _print(study: AllocationStudy) -> None:
     console.print_table(f"{history.name}: {len(history)} samples, {len(history.effectors.names)} effectors", columns, rows)
     console.print_text(
         "rms, worst: error in parts of the largest demand on the axis; kg: propellant; deg: travel of the surfaces;\n"
-        "KKT: largest residual; bad: answers without a proof; us: time per solve; n: samples.\n"
-        "Every method but the on-off bound keeps to the rates of the surfaces."
+        "KKT: largest residual; bad: answers without a proof; us: time per solve; n: samples."
     )
+    if study.remark:
+        console.print_text(study.remark)
     if found.same != found.outcomes:
         n = len(found.same[0].samples)
         fewer = [tuple(_cell(value) for value in (*row[:4], *row[6:8])) for row in found.rows(same=True)]

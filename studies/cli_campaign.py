@@ -12,7 +12,7 @@ import typer
 from typer.core import TyperGroup
 
 from studies import console
-from studies.cli_options import AsJson, scenario_changes, scenario_file
+from studies.cli_options import AsJson, folder_of, scenario_changes, scenario_file
 from studies.console import Code, InputError
 
 if TYPE_CHECKING:
@@ -48,7 +48,8 @@ def run(
     scenario: Annotated[Path | None, scenario_file("Scenario; with --resume it may be left out.")] = None,
     changes: Annotated[list[str] | None, scenario_changes(_EXAMPLE)] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="STORE", show_default=False, help="New or empty folder of the zarr store.")
+        Path | None,
+        typer.Option("--out", metavar="STORE", show_default=False, parser=folder_of, help="New or empty folder of the zarr store."),
     ] = None,
     cases: Annotated[
         int | None, typer.Option("--cases", min=1, max=10**8, show_default=False, help="Number of flights; campaign.cases unless given.")
@@ -105,7 +106,7 @@ def show(place: Place, report: Report = None, as_json: AsJson = False) -> None:
 def replay(
     place: Place,
     case: Annotated[int, typer.Argument(metavar="CASE", show_default=False, help="Number of the case, from 0.")],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of the figure.")] = Path(),
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", parser=folder_of, help="Folder of the figure.")] = Path(),
     as_json: AsJson = False,
 ) -> None:
     """Fly one case again, compare it with the store, and draw its flight."""

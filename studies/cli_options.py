@@ -18,9 +18,16 @@ def scenario_changes(example: str) -> Any:
     return typer.Option("--set", metavar="KEY=VALUE", show_default=False, help=f"Change one key, such as {example}; repeatable.")
 
 
+def folder_of(text: str | Path) -> Path:
+    """Folder that the text of an option names: no text is no folder, and the current one is called "." (for `parser` of the option)."""
+    if not str(text).strip():
+        raise typer.BadParameter(f"found {str(text)!r}, expected a folder; the current folder is .")
+    return Path(text)
+
+
 def out_folder(text: str) -> Any:
     """Option ``--out`` of a folder that is not written unless it is given; `text` is its help."""
-    return typer.Option("--out", metavar="DIR", show_default=False, help=text)
+    return typer.Option("--out", metavar="DIR", show_default=False, help=text, parser=folder_of)
 
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]

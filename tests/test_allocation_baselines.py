@@ -106,6 +106,14 @@ def test_flat_sets_and_outlines():
         attainable.attainable_set(some(6, 60))
 
 
+@pytest.mark.parametrize(("unit", "label"), [("N m", "x [N m]"), ("", "x")])
+def test_figure_of_the_attainable_set_names_the_unit(unit, label):
+    e = Effectors(("a", "b"), [[1.0, 0.0], [0.0, 2.0]], [0, -1], [1, 1], axes=("x", "y"), unit=unit)
+    ax = attainable.attainable_set(e).plot([[0.5, 0.5], [3.0, 3.0]]).axes[0]
+    assert ax.get_xlabel() == label
+    assert ax.get_ylabel() == label.replace("x", "y")
+
+
 def test_on_off_bound_equals_enumeration():
     rng = np.random.default_rng(3)
     e = Effectors(tuple("abcdef"), rng.normal(size=(2, 6)), np.zeros(6), np.ones(6), flow=rng.uniform(1, 2, 6))
@@ -113,12 +121,47 @@ def test_on_off_bound_equals_enumeration():
     demand = rng.normal(size=(6, 2))
     found = bound.on_off(e, demand, weights=weights)
     fuel = bound.PROPELLANT * e.flow / e.flow.sum()
+    able = weights.axis * np.abs(e.B).sum(axis=1)  # the axis that matters most costs 1 where all is missed
     for k, v in enumerate(demand):
-        costs = [np.abs(weights.axis * (e.B @ np.array(c) - v)).sum() + fuel @ np.array(c) for c in itertools.product((0.0, 1.0), repeat=6)]
+        costs = [
+            np.abs(weights.axis * (e.B @ np.array(c) - v)).sum() / able.max() + fuel @ np.array(c)
+            for c in itertools.product((0.0, 1.0), repeat=6)
+        ]
         assert found.cost[k] == pytest.approx(min(costs), rel=1e-6)
         assert found.proof[k] <= found.cost[k]
     assert found.allocation.ok
     assert np.isin(found.allocation.u, (0, 1)).all()
+
+
+def test_scale_of_the_weights_is_of_no_effect_on_the_bound():
+    """An error of 2e-4 of what both jets can do is not worth a jet that is half of the propellant, in whatever unit the weights are."""
+    e = Effectors(("surface", "jet"), [[1e5, 40.0]], [-1, 0], [1, 1], flow=[0, 1])
+    for demand, fires in ((1e5 + 40.0, 0), (1e5 + 40.0 + 200, 1)):
+        strong = Effectors(e.names, [[1e5, demand - 1e5]], e.lower, e.upper, flow=e.flow)
+        for scale in (1e-9, 1.0, 1e6):
+            found = bound.on_off(strong, [demand], weights=qp.Weights(np.array([scale]), np.ones(2), np.zeros(2)))
+            assert found.allocation.u[1] == fires, (demand, scale)
+            able = 1e5 + strong.B[0, 1]
+            assert found.cost == pytest.approx(bound.PROPELLANT if fires else (demand - 1e5) / able, rel=1e-6)
+
+
+def test_jets_that_push_against_each_other():
+    e = Effectors(("up", "down", "side"), [[26.0, -25.0, 0.1], [0.3, 0.0, 8.0]], np.zeros(3), np.ones(3), flow=[4, 4, 4])
+    weights = qp.Weights(np.ones(2), np.ones(3), np.zeros(3))
+    demand = np.array([[1.0, 0.0], [1.0, 8.0], [26.0, 0.0], [-25.0, 8.0]])
+    fuel = bound.PROPELLANT * e.flow / 12
+    able = np.abs(e.B).sum(axis=1).max()
+    for opposed in (True, False):
+        found = bound.on_off(e, demand, weights=weights, opposed=opposed)
+        allowed = [c for c in itertools.product((0.0, 1.0), repeat=3) if opposed or not c[0] * c[1]]
+        for k, v in enumerate(demand):
+            costs = [np.abs(e.B @ np.array(c) - v).sum() / able + fuel @ np.array(c) for c in allowed]
+            assert found.allocation.u[k].tolist() == list(allowed[int(np.argmin(costs))])
+        assert found.allocation.u[0].tolist() == ([1, 1, 0] if opposed else [0, 0, 0])
+    jammed = bound.on_off(e.failed({"up": 1.0}), demand[0], weights=weights, opposed=False)
+    assert jammed.allocation.u.tolist() == [1, 1, 0]  # the only answer to a jet that does not stop
+    always = Effectors(e.names, e.B, [0.5, 0.5, 0], e.upper, flow=e.flow)
+    assert bound.on_off(always, demand[0], weights=weights, opposed=False).allocation.ok
 
 
 def test_on_off_bound_with_short_pulses_and_surfaces():

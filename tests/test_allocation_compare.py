@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from allocation import compare, methods, qp
-from allocation.compare import History, user_method
+from allocation.compare import user_method
 from allocation.core import Effectors
+from allocation.demand_history import History
 from models.checked import ModelError
 
 DEMAND = np.array([[0.4], [1.0], [-0.9], [0.0], [0.2], [-3.0]])
@@ -59,6 +60,23 @@ def test_all_methods_on_one_history():
     assert len(table.plot().axes) == 2
     with pytest.raises(ModelError, match="no method 'magic'"):
         table["magic"]
+
+
+def test_figure_names_the_unit():
+    labels = [ax.get_ylabel() for ax in compare.compare(pitch(unit="N m"), [methods.own()]).plot().axes]
+    assert labels == ["M demand [N m]", "M unmet [N m]"]
+    assert [ax.get_ylabel() for ax in compare.compare(pitch(), [methods.own()]).plot().axes] == ["M demand", "M unmet"]
+
+
+def test_on_off_bound_fires_no_jets_against_each_other():
+    e = Effectors(("elevon", "up", "down"), [[-1e3, 2.67e5, -2.53e5]], [-0.3, 0, 0], [0.2, 1, 1], flow=[0, 8, 8])
+    history = History(effectors=e, dt=0.06, demand=np.array([[1.3e4], [2.5e5], [-2.5e5]]), axis_weight=np.ones((3, 1)),
+                      effector_weight=np.ones((3, 3)))  # fmt: skip
+    assert compare.compare(history, [methods.on_off_bound()]).outcomes[0].u[:, 1:].tolist() == [[0, 0], [1, 0], [0, 1]]
+    both = compare.compare(history, [methods.on_off_bound(opposed=True)]).outcomes[0]
+    assert both.u[:, 1:].tolist() == [[1, 1], [1, 0], [0, 1]]
+    dear = compare.compare(history.part(slice(0, 1)), [methods.on_off_bound(opposed=True)]).outcomes[0]
+    assert dear.propellant == pytest.approx(2 * 8 * 0.06)
 
 
 def test_rates_bind_every_method():
@@ -139,6 +157,8 @@ def test_bad_histories_and_methods_are_refused():
         History(effectors=e, dt=0.1, demand=DEMAND, upper=np.ones((2, 3)))
     with pytest.raises(ModelError, match="context qbar"):
         History(effectors=e, dt=0.1, demand=DEMAND, context={"qbar": np.ones(2)})
+    with pytest.raises(ModelError, match="got no methods"):
+        compare.compare(pitch(), [])
     with pytest.raises(ModelError, match="different names"):
         compare.compare(pitch(), [methods.own(), methods.own()])
     with pytest.raises(ModelError, match="no demand_rad in the context"):

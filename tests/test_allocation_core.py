@@ -63,6 +63,31 @@ def test_failures_hold_effectors_where_they_are():
         e.failed(["rudder"])
 
 
+@pytest.mark.parametrize("value", [10.0, -0.31, np.nan])
+def test_a_surface_cannot_be_jammed_beyond_its_stops(value):
+    with pytest.raises(ModelError, match="elevon") as error:
+        pitch().failed({"elevon": value})
+    if np.isfinite(value):
+        assert "expected a value from -0.3 to 0.2; angles are in radians: did you give degrees?" in str(error.value)
+
+
+def test_a_jet_is_jammed_at_a_duty_and_a_limit_may_be_written_with_few_digits():
+    with pytest.raises(ModelError, match=r"up: found 1.5, expected a value from 0 to 1; duty") as error:
+        pitch(flow=[0, 8, 8]).failed({"up": 1.5})
+    assert "radians" not in str(error.value)
+    third = pitch(upper=[1 / 3, 1, 1])
+    assert third.failed({"elevon": 0.333334}).upper[0] == 1 / 3
+    assert third.failed({"elevon": -0.3}).lower[0] == -0.3
+
+
+def test_effectors_show_themselves_in_one_line():
+    many = Effectors(tuple(f"jet{i}" for i in range(44)), np.ones((3, 44)), 0, 1, axes=("L", "M", "N"), flow=8.0, unit="N m")
+    assert repr(many) == "Effectors(44: jet0, jet1, jet2, ...; 44 jets; axes L, M, N in N m)"
+    assert repr(pitch()) == "Effectors(3: elevon, up, down; 0 jets; axes axis1)"
+    assert many.label("M demand") == "M demand [N m]"
+    assert pitch().label("M demand") == "M demand"
+
+
 def test_reach_within_a_sample():
     e = pitch(rate=[0.5, np.inf, np.inf])
     near = e.within_reach([0.1, 0.0, 1.0], 0.1)

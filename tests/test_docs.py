@@ -9,7 +9,15 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = ["README.md", "docs/concepts.md", "docs/modulators.md", "docs/jet_loop.md", "docs/orbiter.md", "docs/tutorials/own_model.md"]
+PAGES = [
+    "README.md",
+    "docs/concepts.md",
+    "docs/modulators.md",
+    "docs/jet_loop.md",
+    "docs/orbiter.md",
+    "docs/allocation.md",
+    "docs/tutorials/own_model.md",
+]
 
 
 def python_blocks(text):

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from allocation import blending
+from allocation import attainable, blending
 from allocation.compare import Method, user_method
 from allocation.core import Effectors
 from models.checked import ModelError
@@ -57,6 +57,8 @@ def test_own_files_are_read(files):
     (files / "D.csv").write_text("M,L\n1,2\n3,4\n", encoding="utf-8")
     swapped = read_history(files / "B.csv", files / "L.csv", files / "D.csv", dt=0.1)
     assert swapped.demand.tolist() == [[2, 1], [4, 3]]
+    (files / "D.csv").write_text("t,L,M\n" + "\n".join(f"{0.1 * k:.1f},1,2" for k in range(1, 4)) + "\n", encoding="utf-8")
+    assert read_history(files / "B.csv", files / "L.csv", files / "D.csv").dt == 0.1  # (0.3 - 0.1)/2 is 0.09999999999999999
 
 
 @pytest.mark.parametrize(
@@ -156,6 +158,15 @@ def test_wrong_calls(capsys, arguments, message):
         (["--methods", "magic"], "unknown name 'magic'"),
         (["--fail", "rudder"], "unknown name 'rudder'"),
         (["--fail", "left=x"], "found 'left=x'"),
+        (["--fail", "left=9"], "expected a value from -0.3 to 0.2; angles are in radians: did you give degrees?"),
+        (["--fail", "=0.1"], "--fail: found '=0.1', expected NAME or NAME=VALUE"),
+        (["--fail", "up", "--fail", "up=0.2"], "--fail: up is given twice"),
+        (["--priority", "M=1", "--priority", " M=2"], "--priority: M is given twice"),
+        (["--cost", "up=1", "--cost", "up=1"], "--cost: up is given twice"),
+        (["--methods", ""], "--methods: found '', expected names such as qp,osqp"),
+        (["--methods", " , "], "--methods: found ' , ', expected names"),
+        (["--methods", "qp,qp"], "--methods: qp is given twice"),
+        (["--methods", "qp,bound", "--bound", "0"], "--methods names bound, and --bound 0 leaves it out"),
         (["--priority", "M"], "expected NAME=FACTOR"),
         (["--priority", "M=0"], "expected a factor > 0"),
         (["--dt", "0.1"], "leave one out"),
@@ -166,6 +177,54 @@ def test_wrong_options(files, capsys, more, message):
     printed = capsys.readouterr().err
     assert message in printed
     assert "Traceback" not in printed
+
+
+@pytest.mark.parametrize("command", [["allocate", "compare", "three-axis"], ["blend"], ["gains"], ["modulator", "census"]])
+@pytest.mark.parametrize("empty", ["", " "])
+def test_a_folder_without_a_name_is_refused(capsys, tmp_path, monkeypatch, command, empty):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main([*command, "--out", empty]) == 2
+    assert "expected a folder" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_current_folder_may_be_named(files, capsys, monkeypatch):
+    (files / "here").mkdir()
+    monkeypatch.chdir(files / "here")
+    assert cli.main(options(files, "--methods", "qp", "--json", "--out", ".")) == 0
+    assert (files / "here" / "allocation.json").is_file()
+
+
+@pytest.mark.parametrize("limited", [True, False])
+@pytest.mark.parametrize("named", ["qp,bound", "qp"])
+def test_rates_are_spoken_of_where_one_method_breaks_them(files, capsys, limited, named):
+    (files / "D.csv").write_text(demand_text(6), encoding="utf-8")
+    if not limited:
+        (files / "L.csv").write_text(LIMITS.replace("0.35", "inf"), encoding="utf-8")
+    assert cli.main(options(files, "--methods", named, "--bound", "3")) == 0
+    assert ("keeps to the rates" in capsys.readouterr().out) == (limited and named == "qp,bound")
+
+
+def test_figures_of_a_scenario_have_units_and_those_of_own_data_have_none(files):
+    def labels(history):
+        figures = allocation.run(history, chosen=["qp"]).figures().values()
+        return {text for figure in figures for ax in figure.axes for text in (ax.get_xlabel(), ax.get_ylabel()) if text}
+
+    moments = labels(allocation.three_axis_history(samples=20)) - {"t [s]"}
+    assert {"M demand [N m]", "M unmet [N m]", "L [N m]", "N [N m]"} <= moments
+    assert all(text.endswith(" [N m]") for text in moments)
+    assert "M demand [N m]" in labels(allocation.pitch_history(_Flight(120)))
+    own = labels(read_history(files / "B.csv", files / "L.csv", files / "D.csv")) - {"t [s]"}
+    assert own == {"L", "M", "L demand", "L unmet", "M demand", "M unmet"}
+
+
+def test_some_demands_on_three_axes_cannot_be_met():
+    history = allocation.three_axis_history()
+    outside = ~attainable.attainable_set(history.effectors).contains(history.demand)
+    assert 0.02 <= outside.mean() <= 0.05
+    own = allocation.run(allocation.without_rates(history), chosen=["qp"]).comparison.outcomes[0]
+    missed = np.abs(own.residual * history.axis_weight).max(axis=1)
+    assert missed[outside].min() > missed[~outside].max()
 
 
 def test_orbiters_effectors_on_three_axes():
