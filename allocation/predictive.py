@@ -36,7 +36,8 @@ class Tradeoff:
     horizon : int
         Cycles looked ahead.
     impulse : float
-        Of the square of the wrench missed so far: lets a later cycle make good what an earlier one missed.
+        Of the square of the wrench missed so far: lets a later cycle make good what an earlier one missed.  Where demands stay out of
+        reach for long, what is owed piles up and is paid back with errors and propellant; hence 0 unless given.
     propellant : float
         Of all jets firing for a whole cycle.
     travel : float
@@ -44,7 +45,7 @@ class Tradeoff:
     """
 
     horizon: int = 8
-    impulse: float = 0.1
+    impulse: float = 0.0
     propellant: float = 1e-3
     travel: float = 1e-3
 
