@@ -5,45 +5,25 @@ Source: Lu & Zhang 2012 (paper 000), section 3.  The angle-of-attack command of 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from allocation.blending import Handover
-from models.checked import Array, ModelError, as_scalar, as_vector
-from models.units import DEG, INCH
-from studies.blend_design import START, sts1_loop
+from models.checked import ModelError, as_scalar
+from models.units import DEG
+from studies.blend_cases import SINGLES as SINGLES
+from studies.blend_cases import SPREAD as SPREAD
+from studies.blend_cases import dispersed, single_parameters, split
+from studies.blend_design import sts1_loop
 from studies.blend_loop import BlendLoop, Flight, LoopSettings, fly, fly_many
 
 if TYPE_CHECKING:
     from studies.result import StudyResult
 
-STRESS = 2 * DEG
-SINGLES: Mapping[str, Mapping[str, float]] = {
-    "nominal": {},
-    "stress +2 deg": {"stress": STRESS},
-    "stress -2 deg": {"stress": -STRESS},
-    "Cm +20 %": {"Cm_factor": 1.2},
-    "Cm -20 %": {"Cm_factor": 0.8},
-    "elevon +20 %": {"elevon_factor": 1.2},
-    "elevon -20 %": {"elevon_factor": 0.8},
-    "CL +20 %": {"CL_factor": 1.2},
-    "CL -20 %": {"CL_factor": 0.8},
-    "CD +20 %": {"CD_factor": 1.2},
-    "CD -20 %": {"CD_factor": 0.8},
-    "c.g. 2 in aft": {"cg_aft": 2 * INCH},
-    "c.g. 2 in forward": {"cg_aft": -2 * INCH},
-    "wind x 0.5": {"wind_factor": 0.5},
-    "wind x 1.5": {"wind_factor": 1.5},
-    "one of six nose-up jets lost": {"up_share": 5 / 6},
-    "Cm +20 %, elevon -20 %": {"Cm_factor": 1.2, "elevon_factor": 0.8},
-}
-SPREAD: Mapping[str, tuple[float, float]] = {
-    "Cm_factor": (0.8, 1.2), "elevon_factor": (0.8, 1.2), "CL_factor": (0.8, 1.2), "CD_factor": (0.8, 1.2),
-    "cg_aft": (-2 * INCH, 2 * INCH), "wind_factor": (0.5, 1.5),
-}  # fmt: skip
+STATISTICS = ("rms_deg", "max_deg", "steady_deg", "pulses", "propellant_kg", "pulses_above_q2", "travel_deg", "peak_g")
 LIMIT_S = 1.0  # a trim that stands at its stop for longer is out of authority
 
 
@@ -133,11 +113,11 @@ class BlendStudy:
     flight : Flight
         The recorded flight.
     singles : mapping of str to Figures
-        Stress cases and single dispersions; empty unless asked for.
+        Stress cases and single dispersions on top of the changes; empty unless asked for.
     stress : mapping of str to Flight
         Recorded stress cases; with the singles.
     ensemble : Figures or None
-        Of `cases` random dispersions; arrays.
+        Of all random dispersions, on top of the changes; arrays (cases,), NaN in the failed ones.
     failed : tuple of int
         Cases of the ensemble that did not stay finite.
     """
@@ -183,12 +163,8 @@ class BlendStudy:
         below = float(np.mean(self.flight["h"] < 0)) * self.loop.settings.duration_s
         if below > 0:
             found.append(f"this flight: below sea level for {below:.1f} s; the ground is not part of the model")
-        if self.ensemble is not None and np.any(self.ensemble.out_of_authority | self.ensemble.outside_tables):
-            data = ensemble_statistics(self.ensemble)
-            found.append(
-                f"dispersions: {data['out_of_authority']} of {data['cases']} flights out of authority, {data['outside_tables']} with an"
-                " angle of attack outside the aerodynamic tables; the statistics are of the others"
-            )
+        if self.ensemble is not None:
+            found += _ensemble_remarks(ensemble_statistics(self.ensemble, self.failed))
         return tuple(found)
 
     def to_dict(self) -> dict[str, Any]:
@@ -201,21 +177,24 @@ class BlendStudy:
         if self.singles:
             data["singles"] = {name: as_json(found) for name, found in self.singles.items()}
         if self.ensemble is not None:
-            data["ensemble"] = ensemble_statistics(self.ensemble) | {"failed": list(self.failed)}
+            data["ensemble"] = ensemble_statistics(self.ensemble, self.failed) | {"failed": list(self.failed)}
         if self.remarks:
             data["remarks"] = list(self.remarks)
         return data
 
-    def summary(self) -> list[tuple[str, float, str]]:
-        """Headline numbers as (label, value, unit)."""
+    def summary(self) -> list[tuple[str, float | str, str]]:
+        """Headline numbers as (label, value, unit); a dynamic pressure that was not passed upwards was reached "never"."""
         n = self.numbers
+        passed: list[tuple[str, float | str, str]] = [
+            (f"{name} reached", time, "s") if time >= 0 else (f"{name} reached", "never", "")
+            for name, time in (("q1", n.q1_s), ("q2", n.q2_s))
+        ]
         return [
             ("tracking error, rms after 10 s", n.rms_deg, "deg"), ("largest error after 10 s", n.max_deg, "deg"),
             ("mean error of the last 60 s", n.steady_deg, "deg"), ("jet pulses", n.pulses, "1"), ("propellant", n.propellant_kg, "kg"),
             ("pulses below q1", n.pulses_below_q1, "1"), ("pulses between q1 and q2", n.pulses_between, "1"),
             ("pulses above q2", n.pulses_above_q2, "1"), ("elevon travel", n.travel_deg, "deg"),
-            ("largest elevon rate", n.max_rate_deg_s, "deg/s"), ("peak load", n.peak_g, "g0"), ("q1 reached", n.q1_s, "s"),
-            ("q2 reached", n.q2_s, "s"),
+            ("largest elevon rate", n.max_rate_deg_s, "deg/s"), ("peak load", n.peak_g, "g0"), *passed,
         ]  # fmt: skip
 
     def figures(self) -> dict[str, Any]:
@@ -231,32 +210,65 @@ class BlendStudy:
         return result(self)
 
 
-def ensemble_statistics(found: Figures) -> dict[str, Any]:
-    """Median, 95th percentile and largest value over the flights in authority and inside the tables; the others are counted."""
-    names = ("rms_deg", "max_deg", "steady_deg", "pulses", "propellant_kg", "pulses_above_q2", "travel_deg", "peak_g")
-    lost = np.asarray(found.out_of_authority | found.outside_tables)
-    counts = {
+def ensemble_statistics(found: Figures, failed: Sequence[int] = ()) -> dict[str, Any]:
+    """Median, 95th percentile and largest value over the flights in authority and inside the tables; the others are counted.
+
+    Parameters
+    ----------
+    found : Figures
+        Arrays (cases,).
+    failed : sequence of int
+        Cases without numbers.
+
+    Returns
+    -------
+    dict
+        Counts; `lost`, the numbers of the flights out of authority or outside the tables; the statistics, unless no flight is left;
+        and how long those of all flights that fall below Mach 2 stay there.
+    """
+    sound = ~np.isin(np.arange(np.size(found.rms_deg)), failed)
+    lost = np.asarray(found.out_of_authority | found.outside_tables) & sound
+    slow = np.asarray(found.below_tables_s)[(found.below_tables_s > 0) & sound]
+    data: dict[str, Any] = {
         "cases": len(lost),
-        "out_of_authority": int(np.sum(found.out_of_authority)),
-        "outside_tables": int(np.sum(found.outside_tables)),
-        "slower_than_mach_2": int(np.sum(found.below_tables_s > 0)),
+        "out_of_authority": int(np.sum(found.out_of_authority & sound)),
+        "outside_tables": int(np.sum(found.outside_tables & sound)),
+        "slower_than_mach_2": len(slow),
+        "lost": np.flatnonzero(lost).tolist(),
     }
-    if lost.all():
-        return counts | {"lost": np.flatnonzero(lost).tolist()}
-    kept = {name: np.asarray(getattr(found, name))[~lost] for name in names}
-    table = {
-        name: {"median": float(np.median(v)), "p95": float(np.percentile(v, 95)), "max": float(v.max())} for name, v in kept.items()
-    }  # fmt: skip
-    return counts | {"lost": np.flatnonzero(lost).tolist(), **table}
+    if len(slow):
+        data["mach_below_2_s"] = {"median": float(np.median(slow)), "max": float(slow.max())}
+    kept = sound & ~lost
+    if kept.any():
+        values = {name: np.asarray(getattr(found, name))[kept] for name in STATISTICS}
+        data |= {
+            name: {"median": float(np.median(v)), "p95": float(np.percentile(v, 95)), "max": float(v.max())} for name, v in values.items()
+        }
+    return data
 
 
-def dispersed(loop: BlendLoop, cases: int, *, seed: int) -> Array:
-    """Parameters (cases, np) with everything of ``SPREAD`` uniform and independent; case i is the same for any number of cases."""
-    p = np.tile(loop.parameters(), (cases, 1))
-    draws = np.random.Generator(np.random.Philox(seed)).random((cases, len(SPREAD)))
-    for j, (name, (low, high)) in enumerate(SPREAD.items()):
-        p[:, loop.params.index(name)] = low + (high - low) * draws[:, j]
-    return p
+def _ensemble_remarks(data: Mapping[str, Any]) -> list[str]:
+    found, left = [], STATISTICS[0] in data
+    if data["lost"] or not left:
+        found.append(
+            f"dispersions: {data['out_of_authority']} of {data['cases']} flights out of authority, {data['outside_tables']} with an"
+            " angle of attack outside the aerodynamic tables; "
+            + ("the statistics are of the others" if left else "no flight is left, so there are no statistics")
+        )
+    if data["slower_than_mach_2"]:
+        found.append(f"dispersions: {slow_flights(data)}")
+    return found
+
+
+def slow_flights(data: Mapping[str, Any]) -> str:
+    """What :func:`ensemble_statistics` says of the flights slower than Mach 2, in words."""
+    if not data["slower_than_mach_2"]:
+        return f"none of {data['cases']} flights slower than Mach 2"
+    times = data["mach_below_2_s"]
+    return (
+        f"{data['slower_than_mach_2']} of {data['cases']} flights slower than Mach 2, for {times['median']:.1f} s (median) and"
+        f" {times['max']:.1f} s at most, with the coefficients of Mach 2"
+    )
 
 
 def run(
@@ -283,9 +295,9 @@ def run(
         Of the flown vehicle by name: parameters such as ``{"Cm_factor": 1.2}``, ``stress`` in rad, and initial states such as ``h``.
         The controller is not told.
     singles : bool
-        Also fly the stress cases and the single dispersions.
+        Also fly the stress cases and the single dispersions, on top of the changes.
     cases : int
-        Random dispersions to fly.
+        Random dispersions to fly, on top of the changes.
     seed : int
     handover, settings : optional
         See :func:`studies.blend_design.sts1_loop`.
@@ -298,22 +310,22 @@ def run(
     if isinstance(cases, bool) or not isinstance(cases, int) or cases < 0:
         raise ModelError(f"blend: cases: expected a whole number, 0 or more, got {cases!r}")
     asked = {name: as_scalar(f"blend: {name}", value) for name, value in (changes or {}).items()}
-    given = dict(asked)
     loop = sts1_loop(method, jets=jets, handover=handover, settings=settings)
-    x0 = np.array([given.pop(name, value) for name, value in START.items()])
-    as_vector("blend: start", x0, loop.model.states)
+    x0, given = split(loop, asked)
     flight = fly(loop, x0, loop.parameters(given))
     found: dict[str, Figures] = {}
     stress: dict[str, Flight] = {}
     if singles:
-        many = figures_of(fly_many(loop, x0, np.stack([loop.parameters(c) for c in SINGLES.values()])))
-        found = {name: one(many, i) for i, name in enumerate(SINGLES)}
-        stress = {name: fly(loop, x0, loop.parameters(c)) for name, c in SINGLES.items() if "stress" in c}
+        vehicles = single_parameters(loop, given)
+        many = figures_of(fly_many(loop, x0, np.stack(list(vehicles.values()))))
+        found = {"as changed" if asked and not SINGLES[name] else name: one(many, i) for i, name in enumerate(SINGLES)}
+        stress = {name: fly(loop, x0, p) for name, p in vehicles.items() if "stress" in SINGLES[name]}
     ensemble: Figures | None = None
     failed: tuple[int, ...] = ()
     if cases:
-        ends = fly_many(loop, x0, dispersed(loop, cases, seed=seed))
+        ends = fly_many(loop, x0, dispersed(loop, cases, seed=seed, changes=given))
         sound = ends["finite"] > 0
         failed = tuple(int(i) for i in np.flatnonzero(~sound))
-        ensemble = figures_of({name: value[sound] for name, value in ends.items()}) if sound.any() else None
+        # all cases stay, so that their numbers are those of the draws
+        ensemble = figures_of({name: np.where(sound, value, np.nan) for name, value in ends.items()})
     return BlendStudy(method, jets, asked, flight, found, stress, ensemble, failed)

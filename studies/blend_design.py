@@ -160,6 +160,7 @@ def sts1_loop(
     model, gains = _model_and_gains(jets, weights)
     return BlendLoop(
         model=model, vehicle=orbiter(), aero=orbiter_aero(), jets=pitch_jets(jets), gains=gains, command=alpha_command(),
-        allocator=allocator(method, hand) if isinstance(method, str) else method, modulator=modulator or DiscretePWPF(k=0.8, delta=0.01),
+        allocator=method if isinstance(method, ca.Function) else allocator(method, hand),
+        modulator=modulator or DiscretePWPF(k=0.8, delta=0.01),
         settings=replace(times, q1=hand.q1, q2=hand.q2),
     )  # fmt: skip

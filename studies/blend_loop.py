@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 
 from models import native
-from models.checked import Array, ModelError, evaluate
+from models.checked import Array, ModelError, as_batch, as_vector, evaluate
 from models.core import Model, unknown_name
 from models.entry import SPHERE, Planet
 from models.modulators import DiscretePWPF
@@ -164,12 +164,14 @@ class BlendLoop:
         return p
 
     def start(self, x0: Array) -> Array:
-        """Carry at t = 0 for a state."""
-        first = dict.fromkeys(self.carry, 0.0) | dict(zip((v.name for v in self.model.states), x0, strict=True))
-        mach = evaluate(self.model.out, x0, np.zeros(4), self.model.p0)[0][self.model.index("mach")]
-        first["alpha_cmd"] = float(self.command(0.0, mach, 0.0))
-        first["q1_s"] = first["q2_s"] = -1.0
-        return np.array(list(first.values()))
+        """Carry at t = 0 for a state (nx,), or carries for states (N, nx)."""
+        x = as_batch("blend loop: x0", x0, self.model.states)
+        mach = evaluate(self.model.out, x, np.zeros(4), self.model.p0)[0][..., self.model.index("mach")]
+        first = np.zeros((*x.shape[:-1], len(self.carry)))
+        first[..., : x.shape[-1]] = x
+        first[..., self.carry.index("alpha_cmd")] = evaluate(self.command, np.zeros(1), mach[..., None], np.zeros(1))[0][..., 0]
+        first[..., [self.carry.index(name) for name in ("q1_s", "q2_s")]] = -1.0
+        return first
 
     @cached_property
     def cycle(self) -> ca.Function:
@@ -317,11 +319,12 @@ def _rk4(rhs: ca.Function, x: ca.SX, u: ca.SX, p: ca.SX, step: float) -> ca.SX:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Flight:
-    """One recorded flight: `t` (N,) s, `record` (N, len(RECORD)) at every control sample, `end` the carry at the end by name."""
+    """One recorded flight: `record` (N, len(RECORD)) at every control sample, `end` the carry at the end by name, `p` (np,) as flown."""
 
     record: Array
     end: Mapping[str, float]
     loop: BlendLoop
+    p: Array
 
     @property
     def t(self) -> Array:
@@ -350,15 +353,16 @@ def fly(loop: BlendLoop, x0: Array, p: Array | None = None, *, compiled: bool = 
     Raises
     ------
     ModelError
-        A number that is not finite.
+        A start of a wrong shape or outside its range, a number that is not finite.
     """
-    end, params = loop.start(x0), loop.parameters() if p is None else p
+    end = loop.start(as_vector("blend loop: x0", x0, loop.model.states))
+    params = loop.parameters() if p is None else p
     function, count = loop.part
     native_part, records = loop.compiled_part if compiled else None, []
     for _ in range(count):
         end, record = native_part(end, params) if native_part is not None else evaluate(function, end, params)
         records.append(record.T)
-    return Flight(np.concatenate(records), dict(zip(loop.carry, end.tolist(), strict=True)), loop)
+    return Flight(np.concatenate(records), dict(zip(loop.carry, end.tolist(), strict=True)), loop, params)
 
 
 def fly_many(loop: BlendLoop, x0: Array, p: Array, *, mode: native.Mode = "accurate") -> dict[str, Array]:
@@ -377,7 +381,9 @@ def fly_many(loop: BlendLoop, x0: Array, p: Array, *, mode: native.Mode = "accur
     dict of str to ndarray (N,)
         By name, and `finite`: 1.0 where the flight stayed finite to its end.
     """
-    starts = np.stack([loop.start(x) for x in np.broadcast_to(x0, (len(p), np.shape(x0)[-1]))])
+    starts = np.atleast_2d(loop.start(x0))
+    if len(starts) == 1:
+        starts = np.tile(starts, (len(p), 1))
     ends = loop.compiled(mode, alone=len(p) == 1).run(starts, np.zeros((loop.settings.cycles, 1)), p)
     found = {name: ends.after[:, i] for i, name in enumerate(loop.carry)}
     return found | {"finite": (ends.outcome == 0).astype(float)}

@@ -16,7 +16,7 @@ from allocation import blending, qp
 from models.checked import ModelError, unknown_name
 
 if TYPE_CHECKING:
-    from studies.blend import Figures
+    from studies.blend import BlendStudy, Figures
     from studies.result import Table
 
 COMPARED = (
@@ -66,9 +66,15 @@ def allocator(method: str, handover: blending.Handover | None = None) -> ca.Func
     ModelError
         An unknown method.
     """
+    return METHODS[_known(method)](handover or blending.Handover())
+
+
+def _known(method: str) -> str:
+    if not isinstance(method, str):
+        raise ModelError(f"blend: method: expected one of {', '.join(METHODS)}, got {method!r}; give a name")
     if method not in METHODS:
         raise ModelError(unknown_name("blend: method", method, METHODS))
-    return METHODS[method](handover or blending.Handover())
+    return method
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +86,7 @@ class MethodComparison:
     found : mapping of str to Figures
         Arrays over the flights, by method.
     kept : ndarray of bool
-        Flights in authority and inside the tables under every method; the statistics are of these.
+        Flights finite, in authority and inside the tables under every method; the statistics are of these.
     """
 
     found: Mapping[str, Figures]
@@ -132,18 +138,52 @@ class MethodComparison:
         return Table(
             title, ("method", *(label for _, label in COMPARED)), cells,
             f"{what} with 95 % confidence intervals over {int(self.kept.sum())} of {len(self.kept)} flights,"
-            " those in authority under every method.",
+            " those in authority and inside the tables under every method.",
         )  # fmt: skip
 
 
 def _interval(values: np.ndarray) -> tuple[float, float]:
     n = len(values)
     if n < 2:
-        raise ModelError(f"compare: {n} flights kept, expected at least two; fly more dispersions")
+        raise ModelError(
+            f"compare: {n} flights are finite, in authority and inside the tables under every method, expected at least two;"
+            " fly more dispersions, or change the vehicle less"
+        )
     return float(values.mean()), float(stdtrit(n - 1, 0.5 + 0.5 * CONFIDENCE) * values.std(ddof=1) / math.sqrt(n))
 
 
-def compare(methods: Sequence[str] = ("paper", "qp", "pinv"), *, cases: int = 200, seed: int = 2012, jets: int = 6) -> MethodComparison:
+def of_studies(studies: Mapping[str, BlendStudy]) -> MethodComparison:
+    """Compare studies of the same random dispersions, one for each method.
+
+    Parameters
+    ----------
+    studies : mapping of str to BlendStudy
+        By method; flown with equal `cases`, `seed` and `changes`.
+
+    Raises
+    ------
+    ModelError
+        No study, one without random dispersions, numbers of flights that differ.
+    """
+    found = {}
+    for method, study in studies.items():
+        if study.ensemble is None:
+            raise ModelError(f"compare: {method} has no random dispersions; fly it with cases of at least 2")
+        found[method] = study.ensemble
+    counts = {method: np.size(ensemble.rms_deg) for method, ensemble in found.items()}
+    if len(set(counts.values())) != 1:
+        raise ModelError(f"compare: expected studies with equal numbers of flights, got {counts}; fly all with the same cases and seed")
+    kept = np.ones(min(counts.values()), dtype=bool)
+    for method, ensemble in found.items():
+        kept &= ~np.asarray(ensemble.out_of_authority | ensemble.outside_tables)
+        kept[list(studies[method].failed)] = False
+    return MethodComparison(found, kept)
+
+
+def compare(
+    methods: Sequence[str] = ("paper", "qp", "pinv"), *, cases: int = 200, seed: int = 2012, jets: int = 6,
+    handover: blending.Handover | None = None, changes: Mapping[str, float] | None = None,
+) -> MethodComparison:  # fmt: skip
     """Fly the same random dispersions under several allocation methods, all inside compiled loops.
 
     Parameters
@@ -154,24 +194,18 @@ def compare(methods: Sequence[str] = ("paper", "qp", "pinv"), *, cases: int = 20
         Flights, >= 2.
     seed : int
     jets : {2, 4, 6}
+    handover : Handover, optional
+    changes : mapping, optional
+        Of the flown vehicle and its start, as :func:`studies.blend.run` takes them.
 
     Raises
     ------
     ModelError
-        An unknown method, fewer than two flights.
+        An unknown method, fewer than two flights, a changed value outside its range.
     """
-    from studies.blend import dispersed, figures_of
-    from studies.blend_design import START, sts1_loop
-    from studies.blend_loop import fly_many
+    from studies.blend import run
 
     if isinstance(cases, bool) or not isinstance(cases, int) or cases < 2:
         raise ModelError(f"compare: cases: expected a whole number of at least 2, got {cases!r}")
-    x0 = np.array(list(START.values()))
-    loops = {method: sts1_loop(method, jets=jets) for method in methods}
-    found, sound = {}, np.ones(cases, dtype=bool)
-    for method, loop in loops.items():
-        ends = fly_many(loop, x0, dispersed(loop, cases, seed=seed))
-        sound &= ends["finite"] > 0
-        found[method] = figures_of(ends)
-        sound &= ~np.asarray(found[method].out_of_authority | found[method].outside_tables)
-    return MethodComparison(found, sound)
+    settings: dict[str, Any] = {"cases": cases, "seed": seed, "jets": jets, "handover": handover, "changes": changes}
+    return of_studies({method: run(method=method, **settings) for method in [_known(m) for m in methods]})

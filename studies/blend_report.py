@@ -5,19 +5,22 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from scipy.interpolate import RegularGridInterpolator
 
 from models.shuttle_trim import trim_elevon
 from models.units import DEG
 from studies import figures as fig
 from studies.blend_tables import comparisons, ensemble_table, headline_table, pulses, singles_table
+from studies.figures import INK
 from studies.result import FigureItem, Headline, StudyResult
 
 if TYPE_CHECKING:
     from studies.blend import BlendStudy
     from studies.blend_loop import Flight
 
-_PALE = "0.6"
+_PALE, _HATCH = "0.6", "////"
 
 
 def result(study: BlendStudy) -> StudyResult:
@@ -25,15 +28,16 @@ def result(study: BlendStudy) -> StudyResult:
     tables = [headline_table(study)]
     if study.singles:
         tables.append(singles_table(study))
-    if study.ensemble is not None:
-        tables.append(ensemble_table(study))
-    n = study.numbers
+    statistics = ensemble_table(study)
+    if statistics is not None:
+        tables.append(statistics)
+    n, s = study.numbers, study.loop.settings
     return StudyResult(
         name="blend",
         title="Hand-over of pitch control from reaction jets to the elevon",
         lead=(
             "Lu and Zhang (2012) hand the pitch control of an orbiter over from jets to the elevon as the dynamic pressure rises from "
-            "q1 = 1000 to q2 = 2500 Pa (equation 20), the jets behind a discrete PWPF modulator. Here the case is flown with the "
+            f"q1 = {s.q1:g} to q2 = {s.q2:g} Pa (equation 20), the jets behind a discrete PWPF modulator. Here the case is flown with the "
             "aerodynamic tables of the STS-1 orbiter, gains from a scheduled LQI synthesis on the symbolic Jacobians, and everything "
             "sampled (10 ms, jets 60 ms) inside one function. The angle-of-attack command of the paper's figure 11 is lost; a documented "
             "one stands in for it."
@@ -50,6 +54,7 @@ def result(study: BlendStudy) -> StudyResult:
 
 def figures(study: BlendStudy) -> list[FigureItem]:
     """All figures of the study."""
+    flap = f"{study.loop.settings.body_flap / DEG:.1f}".replace("-", "−")
     makers: list[fig.Maker[BlendStudy]] = [
         (
             "blend_flight", "The flight, as in figure 11 of the paper",
@@ -61,7 +66,7 @@ def figures(study: BlendStudy) -> list[FigureItem]:
         ),
         (
             "blend_trim", "Trim over the corridor",
-            "Body flap at −11.7 deg; the flight in vermillion. Hatched: no trim within −33 to 18 deg, or beyond the tables.", trim_figure,
+            f"Body flap at {flap} deg; the flight in vermillion. Hatched: no trim within −33 to 18 deg, or beyond the tables.", trim_figure,
         ),
         (
             "blend_gains", "Gains along the flight",
@@ -88,14 +93,17 @@ def flight_figure(study: BlendStudy) -> Any:
     columns = (("mach", 1.0, "Ma [1]"), ("h", 1e3, "h [km]"), ("alpha", DEG, r"$\alpha$ [deg]"), ("q", DEG, "q [deg/s]"),
                ("qbar", 1e3, r"$\bar q$ [kPa]"), ("theta", DEG, r"$\theta$ [deg]"), ("delta_e", DEG, r"$\delta_e$ [deg]"))  # fmt: skip
     for axis, (name, scale, label) in zip(axes, columns, strict=False):
-        axis.plot(t[every], flight[name][every] / scale)
+        axis.plot(t[every], flight[name][every] / scale, label="elevon" if name == "delta_e" else None)
         axis.set_ylabel(label)
     axes[2].plot(t[every], flight["alpha_cmd"][every] / DEG, "--", color="C1", label="command")
     axes[2].legend(loc="upper right")
-    for level in (s.q1, s.q2):
+    for name, level in (("$q_1$", s.q1), ("$q_2$", s.q2)):
         axes[4].axhline(level / 1e3, color=_PALE, linestyle="--", linewidth=0.8)
+        axes[4].annotate(
+            name, (1.0, level / 1e3), xycoords=("axes fraction", "data"), xytext=(2, 0), textcoords="offset points", va="center"
+        )
     axes[6].plot(t[every], flight["trim"][every] / DEG, color="C1", linewidth=0.9, label="trim")
-    axes[6].legend(loc="upper right")
+    _legend_above(axes[6])
     _jets(axes[7], flight)
     axes[8].plot(t[every], used(flight)[every])
     axes[8].set_ylabel("used [kg]")
@@ -118,10 +126,34 @@ def _jets(axis: Any, flight: Flight) -> None:
     axis.set_yticks([-1, 0, 1])
 
 
+def _legend_above(axis: Any) -> None:
+    """Legend on the line of the title, where no curve can be under it."""
+    axis.legend(
+        loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0, ncols=4, columnspacing=0.8, handlelength=1.0, handletextpad=0.4
+    )
+
+
+def _mark_handover(column: Any, flight: Flight) -> None:
+    """Vertical lines in the panels of a column where q1 and q2 are reached, named beside their tops in the first, outside the window."""
+    for name, label, side, shift in (("q1_s", "$q_1$", "right", -2), ("q2_s", "$q_2$", "left", 2)):
+        if flight.end[name] > 0:
+            for axis in column:
+                axis.axvline(flight.end[name], color=_PALE, linewidth=0.8)
+            place = (flight.end[name], 1.0)
+            column[0].annotate(
+                label, place, xycoords=("data", "axes fraction"), xytext=(shift, 0), textcoords="offset points", ha=side, va="top"
+            )
+
+
+def _printed(name: str) -> str:
+    return name.replace("-", "−")
+
+
 def used(flight: Flight) -> Any:
-    """Propellant used up to each sample, kg (all jets working)."""
+    """Propellant used up to each sample, kg, by the jets that work."""
     jets, thrust = flight["jets"], flight.loop.jets
-    rate = np.where(jets > 0, thrust.flow_up, 0.0) + np.where(jets < 0, thrust.flow_down, 0.0)
+    up, down = (flight.p[flight.loop.params.index(name)] for name in ("up_share", "down_share"))
+    rate = np.where(jets > 0, up * thrust.flow_up, 0.0) + np.where(jets < 0, down * thrust.flow_down, 0.0)
     return np.cumsum(rate) * flight.loop.settings.control_s
 
 
@@ -134,13 +166,13 @@ def _window(flight: Flight) -> Any:
 
 def window_figure(study: BlendStudy) -> Any:
     """Close-up of the hand-over."""
-    flight = study.stress.get("stress -2 deg", study.flight)
-    names = ["nominal", "stress −2 deg"] if study.stress else ["this flight"]
-    flights = [study.flight, flight] if study.stress else [study.flight]
+    names, flights = ["this flight" if study.changes else "nominal"], [study.flight]
+    if study.stress:
+        names.append(_printed("stress -2 deg"))
+        flights.append(study.stress["stress -2 deg"])
     rows = ["error", "elevon", "jets' share of the demand", "jets"]
-    figure, axes = fig.small_multiples(
-        [f"{row}: {name}" for row in rows for name in names], cols=len(names), panel_height_mm=36, sharex=True
-    )
+    titles = [f"{rows[0]}: {name}" for name in names] + [row for row in rows[1:] for _ in names]  # the case heads its column
+    figure, axes = fig.small_multiples(titles, cols=len(names), panel_height_mm=36, sharex=True)
     panels = np.array(axes).reshape(len(rows), len(names))
     for column, one in zip(panels.T, flights, strict=True):
         part = _window(one)
@@ -155,19 +187,16 @@ def window_figure(study: BlendStudy) -> Any:
         column[3].plot(t, np.clip(one["duty"][part], -1, 1), color="C1", linewidth=0.9, label="demand")
         column[3].step(t, one["jets"][part], where="post", linewidth=0.7, label="jets", color="C0")
         column[3].set(ylabel="[1]", ylim=(-1.3, 1.3), xlabel="time [s]")
-        for axis in column:
-            for name in ("q1_s", "q2_s"):
-                if one.end[name] > 0:
-                    axis.axvline(one.end[name], color=_PALE, linewidth=0.8)
-    panels[1, 0].legend(loc="center right")
-    panels[3, 0].legend(loc="lower right", ncols=2)
+        _mark_handover(column, one)
+    for row in (1, 3):
+        _legend_above(panels[row, 0])
     return figure
 
 
 def stress_figure(study: BlendStudy) -> Any:
     """Angle of attack and jets in the stress cases."""
     figure, axes = fig.small_multiples(
-        [f"{kind}: {name}" for kind in ("angle of attack", "jets") for name in study.stress], panel_height_mm=42
+        [f"{kind}: {_printed(name)}" for kind in ("angle of attack", "jets") for name in study.stress], panel_height_mm=42
     )
     for i, flight in enumerate(study.stress.values()):
         part = _window(flight)
@@ -177,10 +206,7 @@ def stress_figure(study: BlendStudy) -> Any:
         axes[i].set_ylabel(r"$\alpha$ [deg]")
         axes[2 + i].step(t, flight["jets"][part], where="post", linewidth=0.7)
         axes[2 + i].set(ylabel="command [1]", xlabel="time [s]", ylim=(-1.3, 1.3))
-        for axis in (axes[i], axes[2 + i]):
-            for name in ("q1_s", "q2_s"):
-                if flight.end[name] > 0:
-                    axis.axvline(flight.end[name], color=_PALE, linewidth=0.8)
+        _mark_handover((axes[i], axes[2 + i]), flight)
     axes[0].legend(loc="lower left")
     return figure
 
@@ -198,12 +224,17 @@ def trim_figure(study: BlendStudy) -> Any:
     flight = study.flight
     for axis, value, steps in zip(axes, values, levels, strict=True):
         axis.grid(visible=False)
-        axis.contourf(mach, alpha / DEG, ~shown, levels=[0.5, 1.5], colors="none", hatches=["////"])
+        axis.contourf(mach, alpha / DEG, ~shown, levels=[0.5, 1.5], colors="none", hatches=[_HATCH])
         lines = axis.contour(mach, alpha / DEG, np.ma.masked_where(~shown, value), levels=steps, cmap="cividis", linewidths=0.9)
         axis.clabel(lines, fontsize=6, fmt="%g")
         axis.plot(flight["mach"][::50], flight["alpha"][::50] / DEG, color="C1", linewidth=1.4)
         axis.set(xlabel="Mach number [1]", xlim=(2, 10), ylim=(5, 45))
     axes[0].set_ylabel(r"$\alpha$ [deg]")
+    entries = [
+        Line2D([], [], color="C1", linewidth=1.4, label="flight"),
+        Patch(facecolor="none", edgecolor=INK, hatch=_HATCH, label="no trim, or beyond the tables"),
+    ]
+    figure.legend(handles=entries, loc="outside lower center", ncols=2)
     return figure
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -13,10 +13,15 @@ from studies.console import Code, InputError
 
 if TYPE_CHECKING:
     from studies.blend import BlendStudy
+    from studies.result import Table
+
+_LARGEST_STRESS_DEG = 20.0  # more takes the angle of attack out of the aerodynamic tables
 
 Method = Annotated[str, typer.Option("--method", metavar="NAME", help="Allocation: paper, literal (equation 20 as printed), qp, or pinv.")]
 Jets = Annotated[int, typer.Option("--jets", help="Aft pitch jets in each direction: 2, 4 or 6.")]
-Stress = Annotated[float, typer.Option("--stress", metavar="DEG", help="Amplitude of the command added in the blending window, deg.")]
+Stress = Annotated[
+    float, typer.Option("--stress", metavar="DEG", help="Amplitude of the command added in the blending window, at most 20 deg.")
+]
 Changes = Annotated[
     list[str] | None,
     typer.Option(
@@ -28,7 +33,7 @@ Low = Annotated[float, typer.Option("--q1", metavar="PA", help="Dynamic pressure
 High = Annotated[float, typer.Option("--q2", metavar="PA", help="Dynamic pressure at which the elevon has its full authority.")]
 Singles = Annotated[bool, typer.Option("--singles", help="Also fly the stress cases and the single dispersions.")]
 Cases = Annotated[int, typer.Option("--dispersions", min=0, max=100_000, help="Random dispersed flights, in compiled code.")]
-Compare = Annotated[bool, typer.Option("--compare", help="Fly the random dispersions under paper, qp and pinv, and compare.")]
+Compare = Annotated[bool, typer.Option("--compare", help="Fly the random dispersions under paper, qp, pinv and --method, and compare.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Of the random dispersions.")]
 
 
@@ -49,8 +54,8 @@ def blend(
     """Fly the orbiter through the hand-over from reaction jets to the elevon (STS-1 case of paper 000)."""
     given = _changes(changes or [])
     if stress:
-        if not math.isfinite(stress):
-            raise InputError(f"--stress: found {stress}, expected an amplitude in deg, such as 2")
+        if not abs(stress) <= _LARGEST_STRESS_DEG:
+            raise InputError(f"--stress: found {stress:g} deg, expected an amplitude from -20 to 20 deg, such as 2")
         if "stress" in given:
             raise InputError("--stress and --set stress=... name the same amplitude; give one of them")
         given["stress"] = math.radians(stress)
@@ -61,15 +66,17 @@ def blend(
         from allocation.blending import Handover
         from studies import blend as study_of
 
-        study = study_of.run(
-            method=method, jets=jets, changes=given, singles=singles, cases=dispersions, seed=seed, handover=Handover(q1=q1, q2=q2)
-        )
+        settings: dict[str, Any] = {
+            "jets": jets, "changes": given, "cases": dispersions, "seed": seed, "handover": Handover(q1=q1, q2=q2),
+        }  # fmt: skip
+        study = study_of.run(method=method, singles=singles, **settings)
         data = study.to_dict()
         methods = None
         if compare:
-            from studies.blend_methods import compare as compare_methods
+            from studies.blend_methods import of_studies
 
-            methods = compare_methods(cases=dispersions, seed=seed, jets=jets)
+            names = dict.fromkeys(("paper", "qp", "pinv", method))
+            methods = of_studies({name: study if name == method else study_of.run(method=name, **settings) for name in names})
             data["methods"] = methods.to_dict()
     console.write_answer(out, "blend", data, figures=study.figures)
     for remark in study.remarks:
@@ -80,7 +87,7 @@ def blend(
         _print(study)
         if methods is not None:
             for table in (methods.table(), methods.differences()):
-                console.print_table(table.title, table.columns, table.rows)
+                _print_table(table)
     for number in study.failed[:20]:
         console.say(f"failed: case {number} of the dispersions: a number was not finite")
     if study.failed:
@@ -104,16 +111,17 @@ def _changes(texts: list[str]) -> dict[str, float]:
 
 
 def _print(study: BlendStudy) -> None:
+    from studies.blend_tables import ensemble_table, singles_table
+
     console.print_table(
         f"Blending, method {study.method}, {study.jets} + {study.jets} jets", ("quantity", "value", "unit"), study.summary()
     )
     if study.singles:
-        from studies.blend_tables import singles_table
+        _print_table(singles_table(study))
+    statistics = ensemble_table(study)
+    if statistics is not None:
+        _print_table(statistics)
 
-        table = singles_table(study)
-        console.print_table(table.title, table.columns, table.rows)
-    if study.ensemble is not None:
-        from studies.blend_tables import ensemble_table
 
-        table = ensemble_table(study)
-        console.print_table(table.title, table.columns, table.rows)
+def _print_table(table: Table) -> None:
+    console.print_table(table.title, table.columns, table.rows)
