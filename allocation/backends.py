@@ -4,7 +4,7 @@ Each gets the problem in the same normalized form, with refinement: variables in
 between the largest cost and the tracking weight.  At the wanted ratio of 3e-4 a first-order method calls an answer solved that gives
 half of the demand to each of two effectors, since its own measure is dominated by W^2.  What the milder ratio leaves of the demand is
 added to it, and the problem solved again (method of multipliers), until the KKT residuals of the *wanted* problem are small; they,
-and not the solver's word, decide.  Active-set and interior-point methods are asked for the wanted problem first; the best answer counts.
+and not the solver's word, decide.  Some are asked for the wanted problem first (``AT_ONCE``); the best answer counts.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ ACCEPTED = 1e-5  # KKT residual above which an answer of a back end is not calle
 REFINEMENTS = 8
 FEWEST = 3  # before no gain means the end
 ENOUGH = 1e-10  # KKT residual at which refinement ends
-AT_ONCE = ("clarabel", "daqp", "lsq_linear", "piqp", "quadprog")  # these may well solve the wanted problem itself: asked for it first
+# These may well solve the wanted problem itself and are asked for it first; OSQP and proxqp stop short of it, and HiGHS can go round
+# in circles on it.
+AT_ONCE = ("clarabel", "daqp", "lsq_linear", "piqp", "quadprog")
 _SPARSE = ("clarabel", "highs", "osqp")
 _OPTIONS: dict[str, dict[str, Any]] = {
     "clarabel": {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-11},

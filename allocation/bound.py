@@ -67,6 +67,15 @@ def on_off(
         Relative gap between cost and proof at which the search ends.
     time_limit : float
         s, for each demand; an answer whose proof did not get that far has Status.UNDECIDED, and its proof still holds.
+
+    Returns
+    -------
+    Bound
+
+    Raises
+    ------
+    ModelError
+        A demand that does not fit or is not finite, `shortest` outside [0, 1].
     """
     values = effectors.demands(demand)
     least = as_scalar("on_off: shortest", shortest)
@@ -107,7 +116,8 @@ def _program(effectors: Effectors, weights: Weights, least: float, opposed: bool
     able = np.abs(B) @ np.maximum(np.abs(effectors.lower), np.abs(effectors.upper))
     top_priority = float(np.max(weights.axis * able)) or 1.0  # nothing acts: any scale will do
     W = weights.axis / top_priority
-    fuel = PROPELLANT * flow / max(float(flow[jets].sum()), 1e-300) * effectors.jets
+    fuel = np.zeros(n)  # what jammed jets burn is no choice
+    fuel[jets] = PROPELLANT * flow[jets] / float(flow.sum() or 1.0)
     errors = sp.hstack([sp.csr_matrix(W[:, None] * B), -sp.eye(m), sp.eye(m), sp.csr_matrix((m, j))]).tocsr()
     firing = []
     if j:

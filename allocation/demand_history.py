@@ -27,7 +27,7 @@ class History:
     lower, upper : ndarray, shape (N, n), optional
     context : mapping of str to ndarray (N,)
         What else a method may need, such as qbar.
-    weights : ndarray, shapes (N, m), (N, n), optional
+    axis_weight, effector_weight : ndarray, shapes (N, m), (N, n), optional
         Weights of axes and effectors for each sample; otherwise ``weights_for(effectors)`` for all.
     name : str
     """
@@ -88,14 +88,18 @@ class History:
         )  # fmt: skip
 
     def failed(self, names: Iterable[str] | Mapping[str, float | None]) -> History:
-        """The same history with effectors out of order; see :meth:`allocation.core.Effectors.failed`."""
-        broken = self.effectors.failed(names)
-        gone = [self.effectors.index(name) for name in names]
+        """The same history with effectors out of order.
 
-        def held(values: Array | None, limits: Array) -> Array | None:
-            if values is None:
+        Parameters and errors are those of :meth:`allocation.core.Effectors.failed`.
+        """
+        values = dict(names) if isinstance(names, Mapping) else dict.fromkeys(names)
+        broken = self.effectors.failed(values)
+        gone = [self.effectors.index(name) for name in values]
+
+        def held(moving: Array | None, limits: Array) -> Array | None:
+            if moving is None:
                 return None
-            changed = values.copy()
+            changed = moving.copy()
             changed[:, gone] = limits[gone]
             return changed
 

@@ -155,7 +155,7 @@ def _interpreted(step: ca.Function, ending: ca.Function, columns: list[Array], r
         now, before = now[: len(at)], before[: len(at)]
         if s == 0 and y is None:
             now = before = settled(step, data, now)
-        start = now if y is None else y[at].copy()
+        start = (now if y is None else y[at]).copy()
         found = evaluate(ending, *data, now + (now - before) if y is None else start)
         for again in (False, True):  # the second time from zero
             open_ = np.flatnonzero(~good(found[2]))

@@ -7,11 +7,13 @@ import itertools
 import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import lru_cache
+from queue import Empty, SimpleQueue
+from threading import get_ident
 from typing import Any, Literal, get_args
 
 import casadi as ca
@@ -30,7 +32,7 @@ Backend = Literal["lanes", "c", "interpreter"]
 LANES = (1, 2, 4, 8, 16)
 BEST_LANES = {"x86-64-v4": 8, "x86-64-v3": 8}  # measured on flights; 2 elsewhere
 WORTH_A_THREAD = 64  # vectors of cases; below, starting a thread costs more than it saves
-_MOST_PARTS = 256  # threads that one process may start for batches
+_MOST_POOL = 256  # threads that one process may start for batches
 _MOST_THREADS: ContextVar[int | None] = ContextVar("most_threads", default=None)  # inside shared_by
 
 _DRIVER = """
@@ -302,38 +304,53 @@ def in_threads(
     """
     vectors, most = -(-rows // lanes), _MOST_THREADS.get()
     parts = max(1, min(threads, vectors // vectors_each, threads if most is None else most))
+    if parts == 1:
+        run(0, rows)
+        return
     edges = [min(rows, lanes * (vectors * k // parts)) for k in range(parts)] + [rows]
     todo = deque(itertools.pairwise(edges))
+    active: set[int] = set()  # threads that may hold a part; no lock, which an interrupt could leave closed: these steps are atomic
+    ended: SimpleQueue[None] = SimpleQueue()
+    errors: list[BaseException] = []
 
-    def work(used: Sequence[object] = keep) -> None:
-        while todo:
-            try:
-                part = todo.popleft()
-            except IndexError:  # another thread was faster
-                return
-            run(*part)
+    def work(_keep: Sequence[object] = keep) -> None:  # what is kept lives in the task, even where an interrupt ends the wait
+        active.add(get_ident())
+        try:
+            while todo:
+                try:
+                    part = todo.popleft()
+                except IndexError:  # another thread was faster
+                    break
+                run(*part)
+        except BaseException as error:
+            errors.append(error)
+            todo.clear()
+        finally:
+            active.discard(get_ident())
+            ended.put(None)
 
-    others: list[Future[None]] = []
+    with suppress(RuntimeError):  # no more threads, or the interpreter is about to end: whoever is free does what is left
+        for _ in range(parts - 1):
+            _pool().submit(work)
     try:
-        with suppress(RuntimeError):  # no more threads, or the interpreter is about to end: this thread does what is left
-            for _ in range(parts - 1):
-                others.append(_pool().submit(work))
         work()
     finally:
         todo.clear()
-        _wait([other for other in others if not other.cancel()])
-    for other in others:
-        if not other.cancelled():
-            other.result()
+        _wait(active, ended)
+    if errors:
+        raise errors[0]
 
 
-def _wait(running: Sequence[Future[None]]) -> None:
-    """Wait to the end even if interrupted: they write into arrays of the caller."""
+def _wait(active: set[int], ended: SimpleQueue[None]) -> None:
+    """Wait for all other threads even if interrupted: they write into arrays of the caller."""
+    others: set[int] = {0}
     interrupted: BaseException | None = None
-    while running:
+    while others:
         try:
-            wait(running)
-            break
+            others = active - {get_ident()}
+            if others:
+                with suppress(Empty):
+                    ended.get(timeout=0.05)
         except BaseException as error:
             interrupted = error
     if interrupted is not None:
@@ -343,7 +360,7 @@ def _wait(running: Sequence[Future[None]]) -> None:
 @lru_cache(maxsize=1)
 def _pool() -> ThreadPoolExecutor:
     """Threads that stay: starting two takes longer than many a batch."""
-    return ThreadPoolExecutor(_MOST_PARTS, thread_name_prefix="reentry")
+    return ThreadPoolExecutor(_MOST_POOL, thread_name_prefix="reentry")
 
 
 if hasattr(os, "register_at_fork"):

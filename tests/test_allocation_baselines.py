@@ -176,6 +176,14 @@ def test_on_off_bound_with_short_pulses_and_surfaces():
         bound.on_off(e, [0.6], shortest=2.0)
 
 
+def test_what_jammed_jets_burn_is_no_cost():
+    e = Effectors(("up", "down"), [[1.0, -1.0]], [0, 0], [1, 1], flow=[2.0, 2.0])
+    found = bound.on_off(e.failed({"up": 1, "down": 0.5}), [0.2])
+    assert float(found.cost) == pytest.approx(0.3 / 1.5, rel=1e-9)  # missed, in parts of what the two deliver
+    half = bound.on_off(e.failed({"down": 0}), [1.0])
+    assert float(half.cost) == pytest.approx(bound.PROPELLANT / 2, rel=1e-6)  # one of two equal jets: parts of the flow of all
+
+
 def test_predictive_plan_is_the_optimum_of_its_problem():
     e = Effectors(("s", "up", "down"), [[-2.0, 1.0, -1.0]], [-0.3, 0, 0], [0.2, 1, 1], rate=[0.5, np.inf, np.inf], flow=[0, 1, 1])
     trade = predictive.Tradeoff(horizon=3, impulse=0.4, propellant=0.05, travel=0.2)

@@ -1,5 +1,7 @@
 """Comparison of methods: metrics by hand, user's own allocator, rates, failures, samples, pulses."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -90,6 +92,10 @@ def test_rates_bind_every_method():
 
 
 def test_failures_priorities_and_parts():
+    moving = replace(pitch(), lower=np.tile([-0.3, 0, 0], (6, 1)), upper=np.tile([0.2, 1, 1], (6, 1)))
+    for names in (["up"], (name for name in ["up"]), {"up": None}):
+        assert moving.failed(names).upper.tolist() == [[0.2, 0, 1]] * 6
+    assert moving.failed({"elevon": 0.1}).lower[:, 0].tolist() == [0.1] * 6
     broken = pitch().failed(["up"])
     assert compare.compare(broken, [methods.own()])["QP (own)"].u[:, 1].max() == 0
     jammed = pitch().failed({"elevon": 0.1})

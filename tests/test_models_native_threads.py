@@ -59,6 +59,71 @@ def test_without_another_thread_the_caller_does_all(parts, monkeypatch):
     native._pool.cache_clear()
 
 
+def test_a_part_that_a_busy_thread_takes_late_is_waited_for(monkeypatch):
+    """The pool has one thread, busy; no other can be started: what it takes when it is free belongs to the batch all the same."""
+    native._pool.cache_clear()
+    busy, gate = threading.Event(), threading.Event()
+    native._pool().submit(lambda: (busy.set(), gate.wait(30)))
+    assert busy.wait(30)
+
+    def refused(self):
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", refused)
+    caller, ended = threading.get_ident(), []
+
+    def run(first, last):
+        if threading.get_ident() == caller:
+            gate.set()
+            deadline = time.monotonic() + 5
+            while not ended and first == 0 and time.monotonic() < deadline and len(taken) < 2:
+                time.sleep(0.001)
+        taken.append(first)
+        time.sleep(0.0 if threading.get_ident() == caller else 0.3)
+        ended.append(first)
+
+    taken = []
+    native.in_threads(run, 3, 1, 3, keep=(), vectors_each=1)
+    assert sorted(ended) == [0, 1, 2]
+    monkeypatch.undo()
+    native._pool.cache_clear()
+
+
+def test_an_index_error_of_a_part_is_an_error(parts):
+    def run(first, last):
+        raise IndexError("broken part")
+
+    with pytest.raises(IndexError, match="broken part"):
+        parts(run)
+
+
+def test_tasks_keep_what_they_use_even_if_nobody_waits(monkeypatch):
+    monkeypatch.setattr(native, "_wait", lambda active, ended: None)
+    started, gate, alive = threading.Event(), threading.Event(), []
+    caller = threading.get_ident()
+
+    def batch():
+        held = Held()
+        watch = weakref.ref(held)
+
+        def run(first, last):
+            if threading.get_ident() == caller:
+                assert started.wait(30)
+                return
+            started.set()
+            gate.wait(30)
+            alive.append(watch() is not None)
+
+        native.in_threads(run, 2, 1, 2, keep=(held,), vectors_each=1)
+
+    batch()
+    gate.set()
+    deadline = time.monotonic() + 10
+    while not alive and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert alive == [True]
+
+
 @pytest.mark.parametrize("where", ["caller", "other"])
 def test_an_error_leaves_when_all_threads_have_ended(where, parts):
     here, running, barrier = threading.get_ident(), [], threading.Barrier(4, timeout=60)
