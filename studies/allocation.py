@@ -141,7 +141,8 @@ class AllocationStudy:
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON; what a method has no number for is None.
 
-        "methods": each on the samples that it was asked for; "same_samples": all on the samples that the slowest was asked for.
+        "methods": each on the samples that it was asked for; "same_samples": all on the samples that the slowest was asked for;
+        "remark": :attr:`remark`, unless it is empty.
         """
         history = self.comparison.history
         tables = [
@@ -151,13 +152,14 @@ class AllocationStudy:
             ]
             for same in (False, True)
         ]
-        return {
+        data: dict[str, Any] = {
             "history": {
                 "name": history.name, "samples": len(history), "dt_s": history.dt, "axes": list(history.effectors.axes),
                 "effectors": list(history.effectors.names), "failed": dict(self.failed),
             },
             "methods": tables[0], "same_samples": tables[1],
         }  # fmt: skip
+        return data | ({"remark": self.remark} if self.remark else {})
 
     @property
     def remark(self) -> str:

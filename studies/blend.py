@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from allocation.blending import Handover
-from models.checked import ModelError, as_scalar
+from models.checked import as_scalar
 from models.units import DEG
 from studies.blend_cases import SINGLES as SINGLES
 from studies.blend_cases import SPREAD as SPREAD
-from studies.blend_cases import dispersed, single_parameters, split
+from studies.blend_cases import check_cases, dispersed, single_parameters, split
 from studies.blend_design import sts1_loop
 from studies.blend_loop import BlendLoop, Flight, LoopSettings, fly, fly_many
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from studies.result import StudyResult
 
 STATISTICS = ("rms_deg", "max_deg", "steady_deg", "pulses", "propellant_kg", "pulses_above_q2", "travel_deg", "peak_g")
+AS_CHANGED = "as changed"  # the single without dispersion, if the vehicle or its start was changed
 LIMIT_S = 1.0  # a trim that stands at its stop for longer is out of authority
 
 
@@ -120,6 +121,8 @@ class BlendStudy:
         Of all random dispersions, on top of the changes; arrays (cases,), NaN in the failed ones.
     failed : tuple of int
         Cases of the ensemble that did not stay finite.
+    seed : int
+        Of the random dispersions.
     """
 
     method: str
@@ -130,6 +133,7 @@ class BlendStudy:
     stress: Mapping[str, Flight] = field(default_factory=dict)
     ensemble: Figures | None = None
     failed: tuple[int, ...] = ()
+    seed: int = 2012
 
     @property
     def loop(self) -> BlendLoop:
@@ -144,21 +148,23 @@ class BlendStudy:
     @property
     def remarks(self) -> tuple[str, ...]:
         """What must not be overlooked."""
-        named = {"this flight": self.numbers, **self.singles}
+        # the single without dispersion is this flight once more
+        others = {name: flown for name, flown in self.singles.items() if name != AS_CHANGED and SINGLES.get(name) != {}}
+        named = {"this flight": self.numbers, **others}
         found = [
-            f"{name}: out of authority: the trim stood at its stop for {one.trim_at_limit_s:.1f} s"
-            for name, one in named.items()
-            if one.out_of_authority
+            f"{name}: out of authority: the trim stood at its stop for {flown.trim_at_limit_s:.1f} s"
+            for name, flown in named.items()
+            if flown.out_of_authority
         ]
         found += [
-            f"{name}: angle of attack outside the aerodynamic tables for {one.outside_tables_s:.1f} s"
-            for name, one in named.items()
-            if one.outside_tables
+            f"{name}: angle of attack outside the aerodynamic tables for {flown.outside_tables_s:.1f} s"
+            for name, flown in named.items()
+            if flown.outside_tables
         ]
         found += [
-            f"{name}: slower than Mach 2 for {one.below_tables_s:.1f} s, with the coefficients of Mach 2"
-            for name, one in named.items()
-            if one.below_tables_s > 0
+            f"{name}: slower than Mach 2 for {flown.below_tables_s:.1f} s, with the coefficients of Mach 2"
+            for name, flown in named.items()
+            if flown.below_tables_s > 0
         ]
         below = float(np.mean(self.flight["h"] < 0)) * self.loop.settings.duration_s
         if below > 0:
@@ -307,8 +313,7 @@ def run(
     ModelError
         An unknown method or parameter, a value outside its range.
     """
-    if isinstance(cases, bool) or not isinstance(cases, int) or cases < 0:
-        raise ModelError(f"blend: cases: expected a whole number, 0 or more, got {cases!r}")
+    check_cases(cases)
     asked = {name: as_scalar(f"blend: {name}", value) for name, value in (changes or {}).items()}
     loop = sts1_loop(method, jets=jets, handover=handover, settings=settings)
     x0, given = split(loop, asked)
@@ -318,7 +323,7 @@ def run(
     if singles:
         vehicles = single_parameters(loop, given)
         many = figures_of(fly_many(loop, x0, np.stack(list(vehicles.values()))))
-        found = {"as changed" if asked and not SINGLES[name] else name: one(many, i) for i, name in enumerate(SINGLES)}
+        found = {AS_CHANGED if asked and not SINGLES[name] else name: one(many, i) for i, name in enumerate(SINGLES)}
         stress = {name: fly(loop, x0, p) for name, p in vehicles.items() if "stress" in SINGLES[name]}
     ensemble: Figures | None = None
     failed: tuple[int, ...] = ()
@@ -328,4 +333,4 @@ def run(
         failed = tuple(int(i) for i in np.flatnonzero(~sound))
         # all cases stay, so that their numbers are those of the draws
         ensemble = figures_of({name: np.where(sound, value, np.nan) for name, value in ends.items()})
-    return BlendStudy(method, jets, asked, flight, found, stress, ensemble, failed)
+    return BlendStudy(method, jets, asked, flight, found, stress, ensemble, failed, seed)

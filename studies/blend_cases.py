@@ -96,6 +96,18 @@ def single_parameters(loop: BlendLoop, changes: Mapping[str, float] | None = Non
     return found
 
 
+def check_cases(cases: int) -> None:
+    """Refuse a number of random dispersions that is none.
+
+    Raises
+    ------
+    ModelError
+        Not a whole number, or less than 0.
+    """
+    if isinstance(cases, bool) or not isinstance(cases, int) or cases < 0:
+        raise ModelError(f"blend: cases: expected a whole number, 0 or more, got {cases!r}")
+
+
 def dispersed(loop: BlendLoop, cases: int, *, seed: int, changes: Mapping[str, float] | None = None) -> Array:
     """Parameters of random dispersions: everything of ``SPREAD`` uniform and independent.
 
@@ -115,8 +127,9 @@ def dispersed(loop: BlendLoop, cases: int, *, seed: int, changes: Mapping[str, f
     Raises
     ------
     ModelError
-        A changed parameter that leaves its range at an end of its spread.
+        A number of cases that is none, a changed parameter that leaves its range at an end of its spread.
     """
+    check_cases(cases)
     given = dict(changes or {})
     p = np.tile(loop.parameters(given), (cases, 1))
     draws = np.random.Generator(np.random.Philox(seed)).random((cases, len(SPREAD)))

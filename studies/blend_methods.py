@@ -24,6 +24,7 @@ COMPARED = (
     ("travel_deg", "elevon travel [deg]"), ("pulses_above_q2", "pulses above q2 [1]"),
 )  # fmt: skip
 CONFIDENCE = 0.95
+ENOUGH = 2  # flights: one alone has no spread, so no interval
 
 
 def redistributed(handover: blending.Handover | None = None, *, name: str = "blend_pinv") -> ca.Function:
@@ -93,7 +94,13 @@ class MethodComparison:
     kept: np.ndarray
 
     def interval(self, method: str, quantity: str) -> tuple[float, float]:
-        """Mean and half-width of its 95 % confidence interval (Student's t) over the flights kept."""
+        """Mean and half-width of its confidence interval (Student's t, level ``CONFIDENCE``) over the flights kept.
+
+        Raises
+        ------
+        ModelError
+            Fewer than two flights are kept.
+        """
         return _interval(self._kept(method, quantity))
 
     def difference(self, method: str, other: str, quantity: str) -> tuple[float, float]:
@@ -103,20 +110,33 @@ class MethodComparison:
     def _kept(self, method: str, quantity: str) -> np.ndarray:
         return np.asarray(getattr(self.found[method], quantity), dtype=float)[self.kept]
 
+    @property
+    def remark(self) -> str:
+        """Why there are no intervals; empty where there are."""
+        n = int(self.kept.sum())
+        return "" if n >= ENOUGH else _too_few(n)
+
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able result."""
+        """JSON-able result; where fewer than two flights are kept, the intervals are missing and "remark" says why."""
         first, *others = self.found
+        quantities = [] if self.remark else [name for name, _ in COMPARED]
 
         def named(value: tuple[float, float]) -> dict[str, float]:
             return {"mean": value[0], "half_width": value[1]}
 
-        return {
+        data = {
             "cases": len(self.kept), "kept": int(self.kept.sum()), "confidence": CONFIDENCE,
-            "methods": {method: {name: named(self.interval(method, name)) for name, _ in COMPARED} for method in self.found},
-            f"differences_from_{first}": {
-                method: {name: named(self.difference(method, first, name)) for name, _ in COMPARED} for method in others
+            "methods": {method: {name: named(self.interval(method, name)) for name in quantities} for method in self.found},
+            "differences": {
+                "from": first,
+                "methods": {method: {name: named(self.difference(method, first, name)) for name in quantities} for method in others},
             },
         }  # fmt: skip
+        return data | ({"remark": self.remark} if self.remark else {})
+
+    def tables(self) -> list[Table]:
+        """Means and differences; none where fewer than two flights are kept."""
+        return [] if self.remark else [self.table(), self.differences()]
 
     def table(self) -> Table:
         """One row for each method: means with their confidence intervals."""
@@ -137,19 +157,24 @@ class MethodComparison:
         cells = [[method, *(cell(row(name)) for name, _ in COMPARED)] for method, row in rows.items()]
         return Table(
             title, ("method", *(label for _, label in COMPARED)), cells,
-            f"{what} with 95 % confidence intervals over {int(self.kept.sum())} of {len(self.kept)} flights,"
+            f"{what} with {100 * CONFIDENCE:g} % confidence intervals over {int(self.kept.sum())} of {len(self.kept)} flights,"
             " those in authority and inside the tables under every method.",
         )  # fmt: skip
 
 
 def _interval(values: np.ndarray) -> tuple[float, float]:
     n = len(values)
-    if n < 2:
-        raise ModelError(
-            f"compare: {n} flights are finite, in authority and inside the tables under every method, expected at least two;"
-            " fly more dispersions, or change the vehicle less"
-        )
+    if n < ENOUGH:
+        raise ModelError(_too_few(n))
     return float(values.mean()), float(stdtrit(n - 1, 0.5 + 0.5 * CONFIDENCE) * values.std(ddof=1) / math.sqrt(n))
+
+
+def _too_few(n: int) -> str:
+    flights = "1 flight is" if n == 1 else f"{n} flights are"
+    return (
+        f"compare: {flights} finite, in authority and inside the tables under every method, expected at least two for an interval;"
+        " fly more dispersions, or change the vehicle less"
+    )
 
 
 def of_studies(studies: Mapping[str, BlendStudy]) -> MethodComparison:
@@ -158,26 +183,44 @@ def of_studies(studies: Mapping[str, BlendStudy]) -> MethodComparison:
     Parameters
     ----------
     studies : mapping of str to BlendStudy
-        By method; flown with equal `cases`, `seed` and `changes`.
+        By method; flown with equal `cases`, `seed`, `changes`, `jets`, q1 and q2.
 
     Raises
     ------
     ModelError
-        No study, one without random dispersions, numbers of flights that differ.
+        No study, one without random dispersions, studies of flights that differ.
     """
+    if not studies:
+        raise ModelError("compare: no study is given, expected at least one, by method; fly some with studies.blend.run")
     found = {}
     for method, study in studies.items():
         if study.ensemble is None:
             raise ModelError(f"compare: {method} has no random dispersions; fly it with cases of at least 2")
         found[method] = study.ensemble
-    counts = {method: np.size(ensemble.rms_deg) for method, ensemble in found.items()}
-    if len(set(counts.values())) != 1:
-        raise ModelError(f"compare: expected studies with equal numbers of flights, got {counts}; fly all with the same cases and seed")
-    kept = np.ones(min(counts.values()), dtype=bool)
+    first, *others = studies
+    wanted = _flown(studies[first])
+    for method in others:
+        for what, value in _flown(studies[method]).items():
+            if value != wanted[what]:
+                raise ModelError(
+                    f"compare: {method} and {first} differ in {what}: found {value} and {wanted[what]}, expected equal ones;"
+                    " fly all methods with the same cases, seed, changes, jets and hand-over"
+                )
+    kept = np.ones(np.size(found[first].rms_deg), dtype=bool)
     for method, ensemble in found.items():
         kept &= ~np.asarray(ensemble.out_of_authority | ensemble.outside_tables)
         kept[list(studies[method].failed)] = False
     return MethodComparison(found, kept)
+
+
+def _flown(study: BlendStudy) -> dict[str, Any]:
+    """What must be equal for flight i of one study to be flight i of another."""
+    settings = study.loop.settings
+    flights = 0 if study.ensemble is None else np.size(study.ensemble.rms_deg)
+    return {
+        "the number of flights": flights, "seed": study.seed, "changes": dict(study.changes), "jets": study.jets,
+        "q1": settings.q1, "q2": settings.q2,
+    }  # fmt: skip
 
 
 def compare(
@@ -189,7 +232,7 @@ def compare(
     Parameters
     ----------
     methods : sequence of str
-        Names of ``METHODS``.
+        Names of ``METHODS``; one that is named twice is flown once.
     cases : int
         Flights, >= 2.
     seed : int
@@ -208,4 +251,4 @@ def compare(
     if isinstance(cases, bool) or not isinstance(cases, int) or cases < 2:
         raise ModelError(f"compare: cases: expected a whole number of at least 2, got {cases!r}")
     settings: dict[str, Any] = {"cases": cases, "seed": seed, "jets": jets, "handover": handover, "changes": changes}
-    return of_studies({method: run(method=method, **settings) for method in [_known(m) for m in methods]})
+    return of_studies({method: run(method=method, **settings) for method in dict.fromkeys([_known(m) for m in methods])})

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,6 +21,7 @@ app = typer.Typer(
 )  # fmt: skip
 
 File = Path | None
+_FACTOR = "NAME=FACTOR such as M=10"
 
 
 @app.callback()
@@ -74,7 +74,8 @@ def compare(
     out: AnswerFolder = None,
 ) -> None:
     """Compare allocation methods on one demand history: tracking, propellant, pulses, travel, optimality, time."""
-    failed, factors = _failures(fail or []), (_factors("--priority", priority or []), _factors("--cost", cost or []))
+    failed = _failures(fail)
+    factors = [console.numbers(option, texts, expected=_FACTOR) for option, texts in (("--priority", priority), ("--cost", cost))]
     chosen = None if methods is None else _chosen(methods, bound)
     console.check_out(out)
     with console.work():
@@ -130,40 +131,9 @@ def _chosen(text: str, bound: int) -> list[str]:
     return names
 
 
-def _failures(texts: list[str]) -> dict[str, float | None]:
-    found: dict[str, float | None] = {}
-    for text in texts:
-        name, sign, value = text.partition("=")
-        found[_new("--fail", text, name, found, "NAME or NAME=VALUE")] = _number("--fail", text, value) if sign else None
-    return found
-
-
-def _factors(option: str, texts: list[str]) -> dict[str, float]:
-    found: dict[str, float] = {}
-    for text in texts:
-        name, sign, value = text.partition("=")
-        name = _new(option, text, name if sign else "", found, "NAME=FACTOR such as M=10")
-        found[name] = _number(option, text, value)
-    return found
-
-
-def _new(option: str, text: str, name: str, known: Mapping[str, object], expected: str) -> str:
-    """The name without blanks, if it is one and not among the `known`."""
-    if not name.strip():
-        raise InputError(f"{option}: found {text!r}, expected {expected}")
-    if name.strip() in known:
-        raise InputError(f"{option}: {name.strip()} is given twice; give it once")
-    return name.strip()
-
-
-def _number(option: str, text: str, value: str) -> float:
-    try:
-        number = float(value)
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        raise InputError(f"{option}: found {text!r}, expected a finite number after the =")
-    return number
+def _failures(texts: list[str] | None) -> dict[str, float | None]:
+    named = console.named_values("--fail", texts, expected="NAME or NAME=VALUE", bare=True)
+    return {name: None if value is None else console.number("--fail", name, value) for name, value in named.items()}
 
 
 def _print(study: AllocationStudy) -> None:

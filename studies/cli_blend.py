@@ -52,7 +52,7 @@ def blend(
     out: AnswerFolder = None,
 ) -> None:
     """Fly the orbiter through the hand-over from reaction jets to the elevon (STS-1 case of paper 000)."""
-    given = _changes(changes or [])
+    given = console.numbers("--set", changes, expected="name=number such as Cm_factor=1.2")
     if stress:
         if not abs(stress) <= _LARGEST_STRESS_DEG:
             raise InputError(f"--stress: found {stress:g} deg, expected an amplitude from -20 to 20 deg, such as 2")
@@ -79,35 +79,19 @@ def blend(
             methods = of_studies({name: study if name == method else study_of.run(method=name, **settings) for name in names})
             data["methods"] = methods.to_dict()
     console.write_answer(out, "blend", data, figures=study.figures)
-    for remark in study.remarks:
+    for remark in (*study.remarks, *([methods.remark] if methods is not None and methods.remark else [])):
         console.say(f"note: {remark}")
     if as_json:
         console.print_text(console.to_json(data))
     else:
         _print(study)
         if methods is not None:
-            for table in (methods.table(), methods.differences()):
+            for table in methods.tables():
                 _print_table(table)
     for number in study.failed[:20]:
         console.say(f"failed: case {number} of the dispersions: a number was not finite")
     if study.failed:
         raise typer.Exit(Code.CASES_FAILED)
-
-
-def _changes(texts: list[str]) -> dict[str, float]:
-    given = {}
-    for text in texts:
-        name, sign, value = text.partition("=")
-        try:
-            number = float(value)
-        except ValueError:
-            number = math.nan
-        if not sign or not name.strip() or not math.isfinite(number):
-            raise InputError(f"--set: found {text!r}, expected name=number such as Cm_factor=1.2")
-        if name.strip() in given:
-            raise InputError(f"--set: {name.strip()} is given twice; give it once")
-        given[name.strip()] = number
-    return given
 
 
 def _print(study: BlendStudy) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import json
+import math
 import os
 import signal
 import sys
@@ -127,21 +128,71 @@ def print_scenario(scenario: ScenarioDocument, *, as_json: bool) -> None:
     print_text(to_json(scenario.to_dict()) if as_json else scenario.to_yaml().rstrip("\n"))
 
 
+def named_values(
+    option: str, texts: Sequence[str] | None, *, expected: str, bare: bool = False, again: bool = False
+) -> dict[str, str | None]:
+    """Names and values of a repeatable option ``--option NAME=VALUE``, without the blanks around them.
+
+    Parameters
+    ----------
+    option : str
+        As the user writes it.
+    texts : sequence of str, optional
+    expected : str
+        Named in the message about a text that cannot be split.
+    bare : bool
+        A name may stand alone; its value is then None.
+    again : bool
+        A name may come again: its last value counts.
+
+    Raises
+    ------
+    InputError
+        A text without a name or, unless `bare`, without an equals sign; unless `again`, a name that is given twice.
+    """
+    found: dict[str, str | None] = {}
+    for text in texts or ():
+        name, sign, value = (part.strip() for part in text.partition("="))
+        if not name or not (sign or bare):
+            raise InputError(f"{option}: found {text!r}, expected {expected}")
+        if name in found and not again:
+            raise InputError(f"{option}: {name} is given twice; give it once")
+        found[name] = value if sign else None
+    return found
+
+
+def number(option: str, name: str, value: str | None) -> float:
+    """Value of ``--option NAME=VALUE`` that must be a finite number.
+
+    Raises
+    ------
+    InputError
+        It is none.
+    """
+    try:
+        found = float(value or "")
+    except ValueError:
+        found = math.nan
+    if not math.isfinite(found):
+        raise InputError(f"{option}: found {f'{name}={value}'!r}, expected a finite number after the =")
+    return found
+
+
+def numbers(option: str, texts: Sequence[str] | None, *, expected: str) -> dict[str, float]:
+    """Names and numbers of ``--option NAME=NUMBER``; see :func:`named_values` and :func:`number`."""
+    return {name: number(option, name, value) for name, value in named_values(option, texts, expected=expected).items()}
+
+
 def changes(texts: Sequence[str] | None, *, example: str) -> dict[str, str]:
-    """Keys and values of ``--set KEY=VALUE``; of a key that is given twice the last value counts.
+    """Keys and values of ``--set KEY=VALUE`` of a scenario; of a key that is given twice the last value counts.
 
     Raises
     ------
     InputError
         A text without key or equals sign; `example` is named in its message.
     """
-    found = {}
-    for text in texts or ():
-        key, sign, value = text.partition("=")
-        if not sign or not key.strip():
-            raise InputError(f"--set: found {text!r}, expected key=value such as {example}")
-        found[key.strip()] = value.strip()
-    return found
+    found = named_values("--set", texts, expected=f"key=value such as {example}", again=True)
+    return {key: value or "" for key, value in found.items()}
 
 
 def check_out(out: Path | None) -> None:

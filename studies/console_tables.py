@@ -1,10 +1,14 @@
-"""Tables on a terminal: one that is too wide becomes several, each with the first column, so that no number is broken."""
+"""Tables on a terminal: one that is too wide becomes several, each with the first column, so that no number is broken.
+
+A number is broken only where the terminal has no room for it beside one character of the first column.
+"""
 
 from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 from rich.cells import cell_len
 from rich.table import Table
@@ -22,6 +26,7 @@ class _Column:
     numeric: bool
     widest: int  # with the whole heading on one line
     least: int  # with nothing broken inside a word
+    content: int  # the same without the heading
     stiff: bool  # no cell is broken at all
 
 
@@ -54,9 +59,9 @@ def tables(columns: Sequence[str], rows: Sequence[Sequence[str]], *, numeric: Se
 def _column(heading: str, cells: Sequence[str], numeric: bool, *, first: bool) -> _Column:
     longest = max((cell_len(line) for cell in cells for line in cell.splitlines()), default=0)
     stiff = longest <= (LONG_FIRST if first else LONG)
-    content = longest if stiff else max(cell_len(word) for cell in cells for word in cell.split())
+    content = longest if stiff else max((cell_len(word) for cell in cells for word in cell.split()), default=0)
     least = max([min(content, LONG_FIRST), *(cell_len(word) for word in heading.split())])
-    return _Column(heading, tuple(cells), numeric, max(longest, cell_len(heading)), least, stiff)
+    return _Column(heading, tuple(cells), numeric, max(longest, cell_len(heading)), least, content, stiff)
 
 
 def _total(widths: Sequence[int]) -> int:
@@ -79,9 +84,23 @@ def _table(columns: Sequence[_Column], width: int, *, every_row: bool) -> Table:
     table = Table(title_justify="left")
     for column in columns:
         stiff = column.stiff and not roomy and not narrow
+        fixed = _held(columns, width) if narrow and column is not columns[0] else None
         lines = textwrap.wrap(column.heading, column.least, break_long_words=False) if stiff else [column.heading]
-        table.add_column(Text("\n".join(lines)), justify="right" if column.numeric else "left", overflow="fold", no_wrap=stiff)
+        justify: Literal["left", "right"] = "right" if column.numeric else "left"
+        table.add_column(Text("\n".join(lines)), justify=justify, overflow="fold", no_wrap=stiff, width=fixed)
     for cells in zip(*(c.cells for c in columns), strict=True):
         if every_row or any(cells[1:]):
             table.add_row(*map(Text, cells))
     return table
+
+
+def _held(columns: Sequence[_Column], width: int) -> int | None:
+    """Width of the second of two columns that have no room side by side: its numbers come first, then the names of the rows.
+
+    None where its cells have no room even so, or are long text: all is folded then.
+    """
+    if len(columns) != 2 or not columns[1].stiff:
+        return None
+    first, second = columns
+    room = width - _total([0, 0])
+    return max(second.content, min(second.least, room - first.least)) if second.content < room else None

@@ -203,6 +203,10 @@ def test_rates_are_spoken_of_where_one_method_breaks_them(files, capsys, limited
         (files / "L.csv").write_text(LIMITS.replace("0.35", "inf"), encoding="utf-8")
     assert cli.main(options(files, "--methods", named, "--bound", "3")) == 0
     assert ("keeps to the rates" in capsys.readouterr().out) == (limited and named == "qp,bound")
+    assert cli.main(options(files, "--methods", named, "--bound", "3", "--json")) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert ("remark" in data) == (limited and named == "qp,bound")
+    assert "keeps to the rates" in data.get("remark", "keeps to the rates")
 
 
 def test_figures_of_a_scenario_have_units_and_those_of_own_data_have_none(files):

@@ -239,7 +239,9 @@ def test_methods_are_compared_over_the_same_flights():
     assert found.difference("b", "a", "propellant_kg") == pytest.approx((1.0, 0.0), abs=1e-12)
     assert found.to_dict()["kept"] == 30
     assert [row[0] for row in found.table().rows] == ["a", "b"]
-    data = found.to_dict()["differences_from_a"]
+    differences = found.to_dict()["differences"]
+    assert differences["from"] == "a"
+    data = differences["methods"]
     assert list(data) == ["b"]
     assert data["b"]["propellant_kg"]["mean"] == pytest.approx(1.0)
     assert data["b"]["rms_deg"] == {"mean": 0.0, "half_width": 0.0}

@@ -1,4 +1,4 @@
-"""Blending study: cases on top of changes, comparison under the same settings, statistics of lost, slow and failed flights, figures."""
+"""Blending study: cases on top of changes, comparison under the same settings, statistics of lost, slow and failed flights."""
 
 import inspect
 import json
@@ -14,7 +14,7 @@ from allocation.blending import Handover
 from models import ModelError
 from models.shuttle_trim import trim_elevon
 from models.units import INCH
-from studies import blend, blend_cases, blend_design, blend_loop, blend_methods, blend_report, blend_tables, cli, cli_blend
+from studies import blend, blend_cases, blend_design, blend_loop, blend_methods, blend_tables, cli, cli_blend
 
 DEG = math.pi / 180
 X0 = np.array(list(blend_design.START.values()))
@@ -94,6 +94,19 @@ def test_dispersions_come_on_top_of_the_changes(loop):
         blend_cases.single_parameters(loop, {"wind_factor": 8.0})
 
 
+@pytest.mark.parametrize("cases", [-1, 2.0, True])
+def test_a_number_of_cases_that_is_none_is_refused(loop, cases):
+    with pytest.raises(ModelError, match="cases: expected a whole number, 0 or more"):
+        blend_cases.dispersed(loop, cases, seed=7)
+
+
+@pytest.mark.parametrize(("name", "changes"), [("nominal", {}), ("as changed", {"h": 74e3})])
+def test_what_is_said_of_this_flight_is_said_once(study, name, changes):
+    lost = blend.one(numbers(1, below_tables_s=np.ones(1), trim_at_limit_s=np.full(1, 9.0), outside_tables_s=np.ones(1)), 0)
+    found = replace(study, changes=changes, singles={name: lost, "Cm +20 %": lost})
+    assert [remark.split(":")[0] for remark in found.remarks] == ["Cm +20 %"] * 3
+
+
 def test_singles_fly_the_changed_vehicle(flown, loop):
     calls, _ = flown
     found = blend.run(changes={"wind_factor": 0.8, "cg_aft": 0.01, "stress": 0.02, "h": 74e3}, singles=True)
@@ -118,7 +131,8 @@ def test_the_comparison_flies_what_is_asked(flown, capsys):
     assert cli.main(["blend", "--json", "--dispersions", "4", "--compare", "--method", "literal", *options]) == 0
     data = json.loads(capsys.readouterr().out)
     assert list(data["methods"]["methods"]) == ["paper", "qp", "pinv", "literal"]
-    assert list(data["methods"]["differences_from_paper"]) == ["qp", "pinv", "literal"]
+    assert data["methods"]["differences"]["from"] == "paper"
+    assert list(data["methods"]["differences"]["methods"]) == ["qp", "pinv", "literal"]
     assert sorted(loop.allocator.name() for loop, _, _ in calls) == ["blend_literal", "blend_paper", "blend_pinv", "blend_qp"]
     for loop, x0, p in calls:
         assert (loop.settings.q1, loop.settings.q2, len(loop.jets.up), x0[2]) == (500.0, 2000.0, 4, 74e3)
@@ -148,15 +162,67 @@ def test_compared_flights_are_sound_under_every_method(study):
     found = blend_methods.of_studies(studies)
     assert found.kept.tolist() == [False, True, False, True, False, True]
     assert found.interval("b", "rms_deg")[0] == 3.0
-    with pytest.raises(ModelError, match="equal numbers"):
+    with pytest.raises(ModelError, match="c and a differ in the number of flights: found 5 and 6"):
         blend_methods.of_studies(studies | {"c": replace(study, ensemble=numbers(5))})
     with pytest.raises(ModelError, match="no random dispersions"):
         blend_methods.of_studies({"paper": study})
-    with pytest.raises(ModelError, match="equal numbers"):
+    with pytest.raises(ModelError, match="no study is given"):
         blend_methods.of_studies({})
+
+
+@pytest.mark.parametrize("left", [0, 1, 2])
+def test_a_comparison_of_too_few_flights_is_reported_without_intervals(flown, capsys, tmp_path, left):
+    _, ends = flown
+    ends["trim_limit_s"] = np.where(np.arange(3) < left, 0.0, 9.0)
+    options = ["blend", "--dispersions", "3", "--compare", "--out", str(tmp_path / "out")]
+    assert cli.main([*options, "--json"]) == 0
+    shown = capsys.readouterr()
+    found = json.loads(shown.out)
+    assert json.loads((tmp_path / "out" / "blend.json").read_text(encoding="utf-8")) == found
+    data = found["methods"]
+    assert (data["cases"], data["kept"], data["differences"]["from"]) == (3, left, "paper")
+    rows = [*data["methods"].values(), *data["differences"]["methods"].values()]
+    assert [list(row) for row in rows] == [[name for name, _ in blend_methods.COMPARED] if left == 2 else []] * 5
+    said = {0: "0 flights are finite", 1: "1 flight is finite", 2: ""}[left]
+    assert ("remark" in data) == (left < 2)
+    assert said in data.get("remark", "")
+    assert ("note: compare:" in shown.err) == (left < 2)
+    assert cli.main(options[:-2]) == 0
+    assert ("Methods over the same dispersed flights" in capsys.readouterr().out) == (left == 2)
+
+
+def test_too_few_flights_have_no_interval(study):
     lost = blend_methods.of_studies({"a": replace(study, ensemble=numbers(3, outside_tables_s=np.ones(3)))})
+    assert lost.tables() == []
     with pytest.raises(ModelError, match="0 flights are finite, in authority"):
-        lost.to_dict()
+        lost.interval("a", "rms_deg")
+
+
+def test_only_the_same_flights_are_compared(study):
+    a = replace(study, ensemble=numbers(4))
+    settings = study.loop.settings
+    moved = [replace(study.flight, loop=replace(study.loop, settings=replace(settings, **{q: 1500.0}))) for q in ("q1", "q2")]
+    for given, text in (
+        ({"seed": 3}, "seed: found 3 and 2012"), ({"changes": {"h": 7e4}}, "changes: found {'h': 70000.0} and {}"),
+        ({"jets": 4}, "jets: found 4 and 6"), ({"flight": moved[0]}, "q1: found 1500.0 and 1000.0"),
+        ({"flight": moved[1]}, "q2: found 1500.0 and 2500.0"),
+    ):  # fmt: skip
+        with pytest.raises(ModelError, match=re.escape(f"compare: b and a differ in {text}")):
+            blend_methods.of_studies({"a": a, "b": replace(a, **given)})
+    assert blend_methods.of_studies({"a": a, "b": replace(a, method="qp")}).kept.all()
+
+
+def test_a_method_that_is_named_twice_is_flown_once(flown):
+    calls, _ = flown
+    found = blend_methods.compare(("paper", "qp", "paper"), cases=2, seed=5)
+    assert list(found.found) == ["paper", "qp"]
+    assert len(calls) == 2
+    assert blend.run(cases=2, seed=5).seed == 5
+
+
+def test_the_level_of_confidence_is_told(study, monkeypatch):
+    monkeypatch.setattr(blend_methods, "CONFIDENCE", 0.9)
+    assert "with 90 % confidence" in blend_methods.of_studies({"a": replace(study, ensemble=numbers(4))}).table().caption
 
 
 @pytest.mark.slow
@@ -217,14 +283,6 @@ def test_slow_flights_are_counted_with_their_times(study):
     assert [r[-1] for r in rows] == ["out of authority; below Mach 2 for 25 s", ""]
 
 
-def test_propellant_of_jets_that_do_not_work_is_not_drawn(loop):
-    short = replace(loop, settings=SHORT)
-    for changes in ({}, {"up_share": 0.5}, {"down_share": 0.25}):
-        flight = blend_loop.fly(short, X0, short.parameters(changes))
-        assert blend_report.used(flight)[-1] == pytest.approx(flight.end["propellant"], rel=1e-9)
-        assert flight.end["propellant"] > 1.0
-
-
 def test_a_pressure_that_was_not_passed_was_reached_never(study):
     early = blend.run(settings=SHORT)
     assert early.summary()[-2:] == [("q1 reached", "never", ""), ("q2 reached", "never", "")]
@@ -276,36 +334,6 @@ class _Runs:
         assert len(starts) == len(p)
         self.after, self.outcome = starts, np.zeros(len(p), dtype=int)
         return self
-
-
-def labels(axis):
-    return [text.get_text() for text in axis.get_legend().get_texts()]
-
-
-def test_figures_say_what_they_show(study):
-    top = blend_report.window_figure(study).axes[0]
-    assert top.get_title(loc="left").endswith("error: nominal")
-    assert [text.get_text() for text in top.texts] == ["$q_1$", "$q_2$"]
-    changed = replace(study, changes={"Cm_factor": 1.1}, stress={"stress +2 deg": study.flight, "stress -2 deg": study.flight})
-    figure = blend_report.window_figure(changed)
-    titles = [axis.get_title(loc="left") for axis in figure.axes]
-    assert titles[0].endswith("error: this flight")
-    assert titles[1].endswith("stress −2 deg")
-    assert labels(figure.axes[2]) == ["elevon", "trim", "control term"]
-    stressed = blend_report.stress_figure(changed)
-    assert not any("-2" in axis.get_title(loc="left") for axis in stressed.axes)
-    assert [text.get_text() for text in stressed.axes[1].texts] == ["$q_1$", "$q_2$"]
-    assert labels(blend_report.flight_figure(study).axes[6]) == ["elevon", "trim"]
-    (legend,) = blend_report.trim_figure(study).legends
-    assert [text.get_text() for text in legend.get_texts()] == ["flight", "no trim, or beyond the tables"]
-
-
-def test_texts_name_the_handover_that_was_flown():
-    found = blend.run(handover=Handover(q1=600.0, q2=2200.0), settings=SHORT).result()
-    assert "q1 = 600 to q2 = 2200 Pa" in found.lead
-    said = [row.quantity + row.why for row in found.comparisons]
-    assert any("pulses above 2200 Pa" in text for text in said)
-    assert not any("2500" in text or "1 kPa" in text for text in (*said, found.lead))
 
 
 def test_where_the_orbiter_is_unstable(study):

@@ -53,6 +53,22 @@ def test_only_long_text_gives_way(capsys, monkeypatch):
     assert value in out
 
 
+@pytest.mark.parametrize("width", [20, 24])
+@pytest.mark.parametrize("value", ["5", "0.0723933", "-1.53e-08 kg"])
+@pytest.mark.parametrize("heading", ["value", "the uncertainties"])
+def test_the_first_column_folds_before_a_number_is_broken(capsys, monkeypatch, width, value, heading):
+    name = "equation-20-as-printed-in-it"
+    out = shown(capsys, monkeypatch, width, ("name", heading), [(name, value)])
+    assert value in out
+    body = out.split("┡")[1]
+    assert "".join(line.split("│")[1].strip() for line in body.splitlines() if line.startswith("│")) == name
+    assert max(map(len, out.splitlines())) <= width
+
+
+def test_a_cell_of_many_blanks_is_a_cell(capsys, monkeypatch):
+    assert "second" in shown(capsys, monkeypatch, 30, ("first", "second"), [(" " * 40, " " * 30)])
+
+
 def test_nothing_is_lost_where_a_number_is_wider_than_the_terminal(capsys, monkeypatch):
     out = shown(capsys, monkeypatch, 20, ("name", "value"), [("abcdefghijkl", "0.123456789012345678")])
     cells = [[part.strip() for part in line.split("│")[1:3]] for line in out.splitlines() if line.startswith("│")]
@@ -77,6 +93,21 @@ def test_changes_of_the_command_line():
     for text in ("a.b", "=3", " =3"):
         with pytest.raises(console.InputError, match=r"--set: found .*, expected key=value such as a=1"):
             console.changes([text], example="a=1")
+
+
+def test_options_of_names_and_values():
+    assert console.named_values("--x", None, expected="") == {}
+    assert console.named_values("--x", [" a = 1=2 ", "b="], expected="") == {"a": "1=2", "b": ""}
+    assert console.named_values("--x", ["a", "b=1"], expected="", bare=True) == {"a": None, "b": "1"}
+    assert console.numbers("--x", ["a=1e3", "b = -2"], expected="") == {"a": 1000.0, "b": -2.0}
+    for texts, message in (
+        (["a"], "--x: found 'a', expected n=1"), ([" =1"], "--x: found ' =1', expected n=1"),
+        (["a=1", " a =2"], "--x: a is given twice; give it once"), (["a="], "--x: found 'a=', expected a finite number"),
+        (["a=inf"], "--x: found 'a=inf', expected a finite number after the ="),
+    ):  # fmt: skip
+        with pytest.raises(console.InputError) as caught:
+            console.numbers("--x", texts, expected="n=1")
+        assert message in str(caught.value)
 
 
 def test_answer_is_written_whole_or_not_at_all(tmp_path, capsys):
