@@ -204,9 +204,8 @@ class Comparison:
             for o in whole:
                 panels[2 * i + 1].plot(self.history.t, o.residual[:, i], lw=1, label=o.name)
             panels[2 * i + 1].set_ylabel(effectors.label(f"{axis} unmet"))
-            if i == 0:
-                panels[1].legend(fontsize="small", ncols=3)
         panels[-1].set_xlabel("t [s]")
+        figure.legend(*panels[1].get_legend_handles_labels(), loc="outside upper center", ncols=4, fontsize="small")
         return figure
 
 

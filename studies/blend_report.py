@@ -97,11 +97,9 @@ def flight_figure(study: BlendStudy) -> Any:
         axis.set_ylabel(label)
     axes[2].plot(t[every], flight["alpha_cmd"][every] / DEG, "--", color="C1", label="command")
     axes[2].legend(loc="upper right")
-    for name, level in (("$q_1$", s.q1), ("$q_2$", s.q2)):
+    for name, level, side in (("$q_1$", s.q1, "top"), ("$q_2$", s.q2, "bottom")):  # apart, however near they are
         axes[4].axhline(level / 1e3, color=_PALE, linestyle="--", linewidth=0.8)
-        axes[4].annotate(
-            name, (1.0, level / 1e3), xycoords=("axes fraction", "data"), xytext=(2, 0), textcoords="offset points", va="center"
-        )
+        axes[4].annotate(name, (1.0, level / 1e3), xycoords=("axes fraction", "data"), xytext=(2, 0), textcoords="offset points", va=side)
     axes[6].plot(t[every], flight["trim"][every] / DEG, color="C1", linewidth=0.9, label="trim")
     _legend_above(axes[6])
     _jets(axes[7], flight)
