@@ -169,5 +169,9 @@ def _outcome(future: Any, chunk: int) -> Outcome | _Death:
         return _Death(chunk, error.allowed_failures + 1)
     except CancelledError:
         raise WorkersLostError("the scheduler dropped the work") from None
+    except OSError as error:
+        if future.status == "error":  # it is the chunk's own
+            raise
+        raise WorkersLostError(f"the scheduler is gone ({type(error).__name__})") from None
     finally:
         future.release()

@@ -16,7 +16,7 @@ import pytest
 
 from models.checked import ModelError
 from models.native import native_available
-from studies import campaign
+from studies import campaign, campaign_workers
 from studies.campaign import Campaign
 from studies.campaign_flight import fly_remote
 from studies.scenario import Scenario
@@ -156,6 +156,29 @@ if __name__ == "__main__":
     print(cluster.scheduler_address, flush=True)
     time.sleep(200)
 """
+
+
+@pytest.mark.parametrize("status", ["finished", "error"])
+def test_a_connection_that_breaks_while_a_result_is_fetched(status: str) -> None:
+    """The loss of the scheduler is told; an error of the chunk itself stays what it is."""
+    from distributed.comm.core import CommClosedError
+
+    released = []
+
+    class Fetched:
+        def __init__(self) -> None:
+            self.status = status
+
+        def result(self) -> None:
+            raise CommClosedError("in <TCP (closed)>: ConnectionResetError")
+
+        def release(self) -> None:
+            released.append(True)
+
+    expected = campaign_workers.WorkersLostError if status == "finished" else CommClosedError
+    with pytest.raises(expected, match="CommClosedError" if status == "finished" else "ConnectionResetError"):
+        campaign_workers._outcome(Fetched(), 3)
+    assert released == [True]
 
 
 def test_a_running_scheduler_is_used_and_its_loss_is_told(original: Campaign, tmp_path: Path) -> None:
