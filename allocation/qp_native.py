@@ -149,7 +149,7 @@ def solve_history(
     columns = _columns("solve_history", B, demand, lower, upper, axis_weight, effector_weight, preferred)
     N, m, n = _sizes(columns)
     native_wanted = N >= LONG if compiled is None else compiled
-    chain, kit = _chain(m, n, native_wanted), _kit(m, n, native_wanted)
+    chain, kit = _chain(m, n, native_wanted), _kit(m, n, False)  # of the kit only what solves one problem alone: nothing to compile
     before, room = as_finite("solve_history: start", start), np.asarray(room, dtype=float)
     if before.shape != (n,):
         raise ModelError(f"solve_history: start has shape {before.shape}, expected ({n},)")
@@ -162,7 +162,7 @@ def solve_history(
     table, carry, k = np.empty((N, n + m + 3)), np.concatenate([before, np.zeros(m)]), 0
     while k < N:
         part = chain(carry, rows[k : k + CHAIN].ravel(), room)[0].reshape(CHAIN, -1)[: N - k]
-        bad = np.flatnonzero(~(part[:, n + m :].max(axis=1) <= active_set.TOLERANCE))
+        bad = np.flatnonzero(~qp_chain.good(part[:, n + m :]))
         good = int(bad[0]) if bad.size else len(part)
         table[k : k + good] = part[:good]
         if bad.size:
@@ -174,7 +174,7 @@ def solve_history(
         k += good
         carry = table[k - 1, : n + m]
     kkt = table[:, n + m :]
-    return Solutions(frozen(table[:, :n]), frozen(table[:, n : n + m]), frozen(kkt), kkt.max(axis=1) <= active_set.TOLERANCE)
+    return Solutions(frozen(table[:, :n]), frozen(table[:, n : n + m]), frozen(kkt), qp_chain.good(kkt))
 
 
 def within(lower: Array, upper: Array, before: Array, room: Array) -> tuple[Array, Array]:
