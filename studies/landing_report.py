@@ -216,7 +216,7 @@ def trade_figure(study: LandingStudy) -> Any:
     axis = np.ravel(axis)[0]
     for law in NAMES:
         _cost(axis, law, study.flown[law, "hard"])
-    axis.legend(loc="upper center")
+    axis.legend(loc="upper left")
     return figure
 
 
